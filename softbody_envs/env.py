@@ -1,0 +1,209 @@
+"""The Gymnasium contract, once for all tasks: spaces, seeding, variations, info, images, faults."""
+
+import copy
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import EzPickle
+
+from softbody_envs.rendering import Camera, Renderer
+from softbody_envs.sim.world import CONTROL_PERIOD, World
+from softbody_envs.variations import SPLITS, check_variation, variation_rng
+
+OBS_TYPES = ("pixels", "state", "dict")
+#: Bound of every element of a state vector (m, rad, or a fraction); a value beyond it is clipped.
+STATE_LIMIT = 10.0
+
+
+class SoftbodyEnv(gym.Env, EzPickle, ABC):
+    """
+    Base class of the tasks. A task names its camera, action size and state, builds its scene, and scores it.
+
+    Actions are float32 in [-1, 1]; episodes end by truncation at the registered horizon, never by termination.
+
+    :param obs_type: ``"pixels"`` (uint8 image, height x width x 3), ``"state"`` (float32 vector) or ``"dict"``
+        (``{"image": ..., "state": ...}``)
+    :param image_size: height and width of the observed image, pixels
+    :param split: ``"train"`` (variations 0-799) or ``"eval"`` (800-999): what ``reset`` draws from
+    :param renderer: ``"tiny"`` (any machine) or ``"egl"`` (graphics driver)
+    :param render_mode: ``None`` or ``"rgb_array"``
+    :param render_size: height and width of what ``render`` returns, pixels
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 1 / CONTROL_PERIOD}
+
+    #: What the images show.
+    camera: ClassVar[Camera]
+    #: Number of elements of an action.
+    action_size: ClassVar[int]
+    #: One name for each element of ``state()``.
+    state_names: ClassVar[tuple[str, ...]]
+    #: Performance of a perfect solution: 1 on the normalized scale.
+    best_performance: ClassVar[float]
+    #: Normalized performance from which ``info["is_success"]`` holds.
+    success_threshold: ClassVar[float]
+    #: Simulation steps in one control step, and whether the world holds cloth.
+    steps_per_control: ClassVar[int]
+    deformable: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        obs_type: str = "pixels",
+        image_size: int = 84,
+        split: str = "train",
+        renderer: str = "tiny",
+        render_mode: str | None = None,
+        render_size: int = 480,
+    ) -> None:
+        EzPickle.__init__(self, obs_type, image_size, split, renderer, render_mode, render_size)
+        if obs_type not in OBS_TYPES:
+            raise ValueError(f"obs_type must be one of {', '.join(OBS_TYPES)}, got {obs_type!r}")
+        if split not in SPLITS:
+            raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        self.obs_type = obs_type
+        self.image_size = image_size
+        self.split = split
+        self.render_mode = render_mode
+        self.render_size = render_size
+        self.renderer = Renderer(renderer)
+
+        image = gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
+        state = gym.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (len(self.state_names),), np.float32)
+        spaces = {"pixels": image, "state": state, "dict": gym.spaces.Dict({"image": image, "state": state})}
+        self.observation_space = spaces[obs_type]
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.action_size,), np.float32)
+
+        self.world: World | None = None
+        self.variation: int | None = None
+        self._initial_performance = 0.0
+
+    # -- what a task says ------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _build(self, world: World, rng: np.random.Generator) -> None:
+        """Put the scene of one variation, at rest, into an empty world; ``rng`` draws what varies."""
+
+    @abstractmethod
+    def _control(self, action: np.ndarray) -> None:
+        """Carry out one action, clipped to [-1, 1], and advance the world by one control step."""
+
+    @abstractmethod
+    def _measure(self) -> np.ndarray:
+        """The elements of ``state_names`` now, in m, rad and fractions."""
+
+    @abstractmethod
+    def performance(self) -> float:
+        """How well the task is solved now, in SoftGym's units."""
+
+    @abstractmethod
+    def monotone(self) -> float:
+        """The physical quantity that rises while the task is being solved."""
+
+    def reward(self) -> float:
+        """Reward of the present state (SoftGym: the performance)."""
+        return self.performance()
+
+    def fault(self) -> str | None:
+        """What is wrong with the simulation (an explosion), or ``None``. Checked after every control step."""
+        return None
+
+    def _image(self, size: int) -> np.ndarray:
+        """A fresh RGB image, uint8 ``(size, size, 3)``."""
+        return self.renderer.render(self.world, self.camera, size)[0]
+
+    # -- Gymnasium -------------------------------------------------------------------------------------------------
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        Build a variation: ``options={"variation": i}`` names one of 0..999, otherwise the split's are drawn from.
+
+        :raises ValueError: on an unknown option or an index out of range
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        if unknown := set(options) - {"variation"}:
+            raise ValueError(f'reset knows the option "variation" only, got {", ".join(map(repr, sorted(unknown)))}')
+        if "variation" in options:
+            self.variation = check_variation(options["variation"])
+        else:
+            split = SPLITS[self.split]
+            self.variation = int(self.np_random.integers(split.start, split.stop))
+        if self.world is None:
+            self.world = World(self.steps_per_control, self.deformable)
+            self.renderer.attach(self.world)
+        self.world.clear()
+        self._build(self.world, variation_rng(type(self).__name__, self.variation))
+        self._initial_performance = self.performance()
+        self._last_sound = self._observation(), float(self.reward()), self._info()
+        observation, _, info = self._last_sound
+        return observation, info
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """
+        One control step of 0.08 s. Actions beyond [-1, 1] are clipped.
+
+        :raises ValueError: if the action has the wrong shape or is not finite; nothing has moved then
+        """
+        if self.world is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"action must have shape {self.action_space.shape}, got {action.shape}")
+        if not np.isfinite(action).all():
+            raise ValueError(f"action must be finite, got {action}")
+        self._control(np.clip(action, -1.0, 1.0))
+        if fault := self.fault():
+            # Positions mean nothing any more: repeat the last sound step, end the episode, and start the next one
+            # from a fresh client.
+            self.close()
+            observation, reward, info = copy.deepcopy(self._last_sound)
+            return observation, reward, False, True, info | {"sim_error": fault}
+        self._last_sound = self._observation(), float(self.reward()), self._info()
+        observation, reward, info = self._last_sound
+        return observation, reward, False, False, info
+
+    def render(self) -> np.ndarray | None:
+        """An RGB image, uint8 ``(render_size, render_size, 3)``, if ``render_mode`` is ``"rgb_array"``."""
+        if self.render_mode is None:
+            gym.logger.warn('render() returns nothing: make the environment with render_mode="rgb_array"')
+            return None
+        if self.world is None:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        return self._image(self.render_size)
+
+    def close(self) -> None:
+        """Free the Bullet client; ``reset`` opens a new one."""
+        if self.world is not None:
+            self.world.close()
+            self.world = None
+
+    # -- derived ---------------------------------------------------------------------------------------------------
+
+    def state(self) -> np.ndarray:
+        """The state vector, float32, whatever the observation type is; see ``state_names``."""
+        return np.clip(self._measure(), -STATE_LIMIT, STATE_LIMIT).astype(np.float32)
+
+    def normalized_performance(self) -> float:
+        """0: no better than at reset. 1: perfect."""
+        span = self.best_performance - self._initial_performance
+        return (self.performance() - self._initial_performance) / span
+
+    def _observation(self) -> Any:
+        if self.obs_type == "state":
+            return self.state()
+        image = self._image(self.image_size)
+        return image if self.obs_type == "pixels" else {"image": image, "state": self.state()}
+
+    def _info(self) -> dict[str, Any]:
+        normalized = float(self.normalized_performance())
+        return {
+            "performance": float(self.performance()),
+            "normalized_performance": normalized,
+            "is_success": bool(normalized >= self.success_threshold),
+            "monotone": float(self.monotone()),
+            "variation": self.variation,
+        }

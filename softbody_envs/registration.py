@@ -1,0 +1,18 @@
+"""The table of environment ids."""
+
+import gymnasium as gym
+
+#: id -> (module:class under ``softbody_envs.tasks``, horizon in control steps of 0.08 s)
+_TABLE = {
+    "PourWater-v0": ("pour_water:PourWaterEnv", 100),
+}
+
+#: Every id that ``import softbody_envs`` registers.
+ENV_IDS = tuple(_TABLE)
+
+
+def register_envs() -> None:
+    """Register every task with Gymnasium; importing again changes nothing."""
+    for env_id, (entry_point, horizon) in _TABLE.items():
+        if env_id not in gym.registry:
+            gym.register(env_id, entry_point=f"softbody_envs.tasks.{entry_point}", max_episode_steps=horizon)

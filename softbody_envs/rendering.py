@@ -1,0 +1,81 @@
+"""Cameras and the two renderers: TinyRenderer (any machine) and EGL (a machine with a graphics driver)."""
+
+import importlib.util
+from dataclasses import dataclass
+
+import numpy as np
+import pybullet
+
+from softbody_envs.sim.world import World
+
+RENDERERS = ("tiny", "egl")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """
+    A fixed perspective camera with square images.
+
+    :param position: of the eye, m, z up
+    :param target: the point that appears in the middle of the image, m
+    :param fov: vertical field of view, degrees (SoftGym: 45)
+    :param up: direction that points up in the image
+    """
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    fov: float = 45.0
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    near: float = 0.05
+    far: float = 10.0
+
+    @property
+    def view(self) -> tuple[float, ...]:
+        """World to camera, 16 numbers, column-major as OpenGL has it."""
+        return pybullet.computeViewMatrix(self.position, self.target, self.up)
+
+    @property
+    def projection(self) -> tuple[float, ...]:
+        """Camera to clip space, 16 numbers, column-major."""
+        return pybullet.computeProjectionMatrixFOV(self.fov, 1.0, self.near, self.far)
+
+
+class Renderer:
+    """
+    Draws a world as a camera sees it.
+
+    Images of the two kinds differ (bullet#2410): train and evaluate with the same one.
+
+    :param kind: ``"tiny"`` (software, deterministic) or ``"egl"`` (OpenGL without a display)
+    """
+
+    def __init__(self, kind: str = "tiny") -> None:
+        if kind not in RENDERERS:
+            raise ValueError(f"renderer must be one of {', '.join(RENDERERS)}, got {kind!r}")
+        self.kind = kind
+        self._flag = pybullet.ER_TINY_RENDERER if kind == "tiny" else pybullet.ER_BULLET_HARDWARE_OPENGL
+
+    def attach(self, world: World) -> None:
+        """Load what the renderer needs into a world that holds no bodies yet."""
+        if self.kind == "egl":
+            plugin = importlib.util.find_spec("eglRenderer")
+            loaded = plugin is not None and world.client.loadPlugin(plugin.origin, "_eglRendererPlugin") >= 0
+            if not loaded:
+                raise RuntimeError('renderer="egl" needs an EGL driver, which this machine lacks; use renderer="tiny"')
+
+    def render(self, world: World, camera: Camera, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :return: a fresh RGB frame, uint8 ``(size, size, 3)``, and its depth buffer, float32 ``(size, size)`` in [0, 1]
+        """
+        _, _, rgba, depth, _ = world.client.getCameraImage(
+            size,
+            size,
+            camera.view,
+            camera.projection,
+            lightDirection=(-0.5, -1.5, 2.5),
+            shadow=0,
+            renderer=self._flag,
+            flags=pybullet.ER_NO_SEGMENTATION_MASK,
+        )
+        frame = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4)[:, :, :3].copy()
+        return frame, np.asarray(depth, dtype=np.float32).reshape(size, size)

@@ -1,0 +1,1 @@
+"""Bullet: one client, and the objects the tasks are made of."""

@@ -1,0 +1,1 @@
+"""One file a task: its scene, actions, state, performance and reward."""

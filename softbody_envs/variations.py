@@ -1,0 +1,30 @@
+"""Variations: 1000 numbered scenes a task, 800 to train on and 200 held out, the same on every machine."""
+
+import zlib
+
+import numpy as np
+
+#: The indices that each split draws from.
+SPLITS = {"train": range(0, 800), "eval": range(800, 1000)}
+N_VARIATIONS = 1000
+
+
+def check_variation(index: object) -> int:
+    """
+    :param index: what a user passed as ``options["variation"]``
+    :return: the index as an int
+    :raises ValueError: if it is not an integer in 0..999
+    """
+    if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < N_VARIATIONS:
+        raise ValueError(f'options["variation"] must be an integer from 0 to {N_VARIATIONS - 1}, got {index!r}')
+    return int(index)
+
+
+def variation_rng(task: str, index: int) -> np.random.Generator:
+    """
+    The generator that draws everything which differs between the variations of one task.
+
+    :param task: name of the task's class; two tasks share no random numbers
+    :param index: 0..999
+    """
+    return np.random.default_rng([zlib.crc32(task.encode()), index])

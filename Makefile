@@ -1,0 +1,60 @@
+# make train   set up and train POR on pouring: make train ARGS="-n 20000 --seed 1"
+# make test    set up and run the tests:        make test ARGS="-k plots"
+# make demo    a small run from training to a curve and a GIF, within 10 minutes on two CPU cores
+# make lint, make format, make type, make bench
+
+VENV := .venv
+BIN := $(VENV)/bin
+ARGS ?=
+
+# The first interpreter that runs and that pybullet has wheels for; PYTHON=... names another.
+SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 11))
+PYTHON ?= $(shell for p in python3.11 python3.10 python3 python; do \
+	$$p -c '$(SUPPORTED)' >/dev/null 2>&1 && { echo $$p; break; }; done)
+
+export MPLBACKEND := Agg
+
+.PHONY: train test demo lint format type bench
+
+train: $(VENV)/.installed-test
+	$(BIN)/python train.py --algo sac_por --env PourWater-v0 $(ARGS)
+
+test: $(VENV)/.installed-test
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(ARGS)
+
+DEMO := demo/$(shell date +%Y%m%d-%H%M%S)
+DEMO_RUN := $(DEMO)/sac_por/PourWater-v0_1
+
+demo: $(VENV)/.installed-test
+	$(BIN)/python train.py --algo sac_por --env PourWater-v0 --seed 1 -n 4000 --eval-freq 1000 --eval-episodes 5 \
+		-f $(DEMO) -params learning_starts:500 buffer_size:4000 $(ARGS)
+	$(BIN)/python -m sb3_por evaluate --model $(DEMO_RUN)/best_model.zip --env PourWater-v0 -n 10
+	$(BIN)/python -m sb3_por plot $(DEMO_RUN) -o $(DEMO)/curve.png
+	$(BIN)/python -m sb3_por enjoy --model $(DEMO_RUN)/best_model.zip --env PourWater-v0 -o $(DEMO)/pour_water.gif
+	@printf 'model  %s\ncurve  %s\nGIF    %s\n' $(DEMO_RUN)/best_model.zip $(DEMO)/curve.png $(DEMO)/pour_water.gif
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/black --check .
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/black .
+
+type: $(VENV)/.installed-dev
+	$(BIN)/mypy
+
+bench: $(VENV)/.installed-test
+	for benchmark in benchmarks/*.py; do $(BIN)/python $$benchmark $(ARGS) || exit; done
+
+# One stamp for each set of extras: installed again only when setup.cfg or constraints.txt changed.
+$(VENV)/.installed-test: EXTRAS := test
+$(VENV)/.installed-dev: EXTRAS := test,dev
+$(VENV)/.installed-%: setup.cfg constraints.txt | $(BIN)/pip
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[$(EXTRAS)]'
+	@touch $@
+
+$(BIN)/pip:
+	@$(if $(PYTHON),$(PYTHON),false) -c '$(SUPPORTED)' || { echo "make: Python 3.10 or 3.11 is needed (pybullet has" \
+		"wheels for no other): install one, or name it: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11" >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)

@@ -2,8 +2,11 @@
 
 import sys
 
+from softbody_envs.sim.quiet import quiet
+
 try:
-    import pybullet
+    with quiet():
+        import pybullet
 except ImportError as error:  # pragma: no cover - depends on the machine
     raise ImportError(
         "softbody_envs needs pybullet 3.2.7. It has wheels for CPython 3.10 and 3.11 only "

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
 
+from softbody_envs.sim.quiet import quiet
+
 #: One control step: what an action lasts, s (SoftGym: 8 steps of 0.01 s).
 CONTROL_PERIOD = 0.08
 GRAVITY = -9.8
@@ -22,7 +24,8 @@ class World:
         self.steps_per_control = steps_per_control
         self.time_step = CONTROL_PERIOD / steps_per_control
         self.deformable = deformable
-        self.client = BulletClient(pybullet.DIRECT)
+        with quiet():
+            self.client = BulletClient(pybullet.DIRECT)
 
     def clear(self) -> None:
         """Remove every body and set all settings again: ``resetSimulation`` forgets some of them and keeps others."""

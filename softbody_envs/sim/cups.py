@@ -1,0 +1,132 @@
+"""Open boxes that hold water: what is inside one, and how one is moved without launching its content."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pybullet
+
+from softbody_envs.sim.world import World
+
+#: Thickness of walls and floor, m.
+WALL = 0.03
+
+
+@dataclass(frozen=True)
+class CupSize:
+    """
+    Inner size of a cup. The cup's frame has its origin in the middle of the underside, z toward the opening.
+
+    :param length: along x, m
+    :param width: along y, m
+    :param height: of the cavity, m
+    """
+
+    length: float
+    width: float
+    height: float
+
+    @property
+    def outer_length(self) -> float:
+        """Along x, walls included, m."""
+        return self.length + 2 * WALL
+
+    @property
+    def outer_height(self) -> float:
+        """From the underside to the rim, m."""
+        return self.height + WALL
+
+
+class Cup:
+    """
+    A cup that is moved by its pose alone: kinematic, of five boxes, drawn without its front (TinyRenderer has no
+    transparency; the collision shape is closed).
+
+    :param foot: how far the floor reaches below the underside, m
+    """
+
+    def __init__(self, world: World, size: CupSize, x: float, color: tuple[float, float, float, float], foot: float = 0.0):
+        self._world = world
+        self.size = size
+        self.x, self.z, self.angle = x, 0.0, 0.0
+        half_x, half_y, half_z = size.outer_length / 2, size.width / 2 + WALL, size.outer_height / 2
+        boxes = {  # name: (half extents, centre)
+            "floor": ((half_x, half_y, (WALL + foot) / 2), (0, 0, (WALL - foot) / 2)),
+            "left": ((WALL / 2, half_y, half_z), (-(size.length + WALL) / 2, 0, half_z)),
+            "right": ((WALL / 2, half_y, half_z), ((size.length + WALL) / 2, 0, half_z)),
+            "back": ((half_x, WALL / 2, half_z), (0, (size.width + WALL) / 2, half_z)),
+            "front": ((half_x, WALL / 2, half_z), (0, -(size.width + WALL) / 2, half_z)),
+        }
+        drawn = [box for name, box in boxes.items() if name != "front"]
+        client = world.client
+        collision = client.createCollisionShapeArray(
+            shapeTypes=[pybullet.GEOM_BOX] * len(boxes),
+            halfExtents=[half for half, _ in boxes.values()],
+            collisionFramePositions=[centre for _, centre in boxes.values()],
+        )
+        visual = client.createVisualShapeArray(
+            shapeTypes=[pybullet.GEOM_BOX] * len(drawn),
+            halfExtents=[half for half, _ in drawn],
+            visualFramePositions=[centre for _, centre in drawn],
+            rgbaColors=[color] * len(drawn),
+        )
+        self._body = client.createMultiBody(0, collision, visual, basePosition=(x, 0, 0))
+        client.changeDynamics(self._body, -1, lateralFriction=0.0, restitution=0.0)
+
+    def move(self, x: float, z: float, angle: float) -> None:
+        """
+        Go to a pose within one simulation step.
+
+        The velocity goes with it: from the pose alone the contact solver sees a wall that jumps, and throws the water.
+
+        :param x: of the underside's middle, m
+        :param z: of the underside's middle, m
+        :param angle: tilt toward +x, rad
+        """
+        rate = 1 / self._world.time_step
+        velocity = ((x - self.x) * rate, 0.0, (z - self.z) * rate)
+        spin = (0.0, (angle - self.angle) * rate, 0.0)
+        self.x, self.z, self.angle = x, z, angle
+        orientation = (0.0, np.sin(angle / 2), 0.0, np.cos(angle / 2))
+        self._world.client.resetBasePositionAndOrientation(self._body, (x, 0, z), orientation)
+        self._world.client.resetBaseVelocity(self._body, velocity, spin)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """
+        Which points lie in the cavity, however the cup is tilted.
+
+        :param points: m, ``(n, 3)``
+        :return: bool ``(n,)``
+        """
+        x, y, z = (points - (self.x, 0.0, self.z)).T
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        x, z = cos * x - sin * z, sin * x + cos * z
+        half_x, half_y = self.size.length / 2, self.size.width / 2
+        return (np.abs(x) <= half_x) & (np.abs(y) <= half_y) & (z >= WALL) & (z <= self.size.outer_height)
+
+
+def corners(size: CupSize, x: float, z: float, angle: float) -> np.ndarray:
+    """
+    The outer rectangle of a cup in the x-z plane.
+
+    :return: m, ``(4, 2)``, in the order of the outline
+    """
+    half, top = size.outer_length / 2, size.outer_height
+    outline = np.array([(-half, 0.0), (half, 0.0), (half, top), (-half, top)])
+    cos, sin = np.cos(angle), np.sin(angle)
+    return outline @ np.array([(cos, -sin), (sin, cos)]) + (x, z)
+
+
+def overlap(first: np.ndarray, second: np.ndarray) -> bool:
+    """
+    Whether two convex outlines touch (separating-axis test).
+
+    :param first: ``(n, 2)``
+    :param second: ``(m, 2)``
+    """
+    for outline in (first, second):
+        edges = np.roll(outline, -1, axis=0) - outline
+        for normal in np.stack([edges[:, 1], -edges[:, 0]], axis=1):
+            a, b = first @ normal, second @ normal
+            if a.max() < b.min() or b.max() < a.min():
+                return False
+    return True

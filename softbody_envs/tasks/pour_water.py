@@ -1,0 +1,129 @@
+"""PourWater: tilt a cup until its water is in another cup."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from softbody_envs.env import SoftbodyEnv
+from softbody_envs.rendering import Camera
+from softbody_envs.sim.cups import WALL, Cup, CupSize, corners, overlap
+from softbody_envs.sim.water import DIAMETER, Water, lattice
+from softbody_envs.sim.world import World
+
+#: Largest change of the pose in one control step: x (m), z (m), tilt (rad).
+REACH = np.array([0.08, 0.08, 0.12])
+#: The cup may come this close to the target, m: no particle fits between them and is squeezed through a wall.
+MARGIN = DIAMETER
+#: The sink that catches spilled water lies this far under the cups, so that no cup can press a particle into it, m.
+SINK_DEPTH = 0.10
+#: Control steps in which the water comes to rest before an episode.
+SETTLE_STEPS = 8
+
+
+class PourWaterEnv(SoftbodyEnv):
+    camera: ClassVar[Camera] = Camera(position=(0.22, -1.40, 0.95), target=(0.22, 0.0, 0.27))
+    action_size: ClassVar[int] = 3
+    state_names: ClassVar[tuple[str, ...]] = (
+        "cup x",
+        "cup z",
+        "cup tilt",
+        "cup inner length",
+        "cup inner width",
+        "cup height",
+        "target x",
+        "target height",
+        "target inner length",
+        "target inner width",
+        "highest water",
+        "fraction in target",
+        "fraction in cup",
+    )
+    best_performance: ClassVar[float] = 1.0
+    success_threshold: ClassVar[float] = 0.9
+    steps_per_control: ClassVar[int] = 10
+
+    def _build(self, world: World, rng: np.random.Generator) -> None:
+        columns, rows = rng.integers(4, 7), rng.integers(3, 5)
+        n = int(rng.integers(40, 81))
+        size = CupSize(
+            length=columns * DIAMETER + rng.uniform(0.01, 0.03),
+            width=rows * DIAMETER + rng.uniform(0.01, 0.03),
+            height=np.ceil(n / (columns * rows)) * DIAMETER * rng.uniform(1.15, 1.6) + 0.02,
+        )
+        target = CupSize(
+            length=size.length + rng.uniform(0.0, 0.04),
+            width=size.width + rng.uniform(0.0, 0.04),
+            height=size.height + rng.uniform(0.0, 0.10),
+        )
+        gap = rng.uniform(0.06, 0.20)
+
+        world.client.setPhysicsEngineParameter(
+            numSolverIterations=10, contactBreakingThreshold=0.002, minimumSolverIslandSize=1024
+        )
+        world.add_floor(-SINK_DEPTH)
+        self.cup = Cup(world, size, x=0.0, color=(0.93, 0.80, 0.55, 1.0))
+        self.target = Cup(
+            world,
+            target,
+            x=(size.outer_length + target.outer_length) / 2 + gap,
+            color=(0.75, 0.75, 0.78, 1.0),
+            foot=SINK_DEPTH,
+        )
+        self.water = Water(world, lattice(n, size.length, size.width, WALL, rng))
+        half, top = target.outer_length / 2 + MARGIN, target.outer_height + MARGIN
+        self._forbidden = np.array([(-half, -SINK_DEPTH), (half, -SINK_DEPTH), (half, top), (-half, top)]) + (self.target.x, 0)
+        self._low = np.array([-0.3, 0.0, -np.pi])
+        self._high = np.array([self.target.x + 0.3, 0.75, np.pi])
+        for _ in range(SETTLE_STEPS * self.steps_per_control):
+            world.step()
+        self._locate()
+
+    def _control(self, action: np.ndarray) -> None:
+        change = action * REACH / self.steps_per_control
+        for _ in range(self.steps_per_control):
+            here = np.array([self.cup.x, self.cup.z, self.cup.angle])
+            there = np.clip(here + change, self._low, self._high)
+            self.cup.move(*(there if self._allowed(there) else here))
+            self.world.step()
+        self._locate()
+
+    def _allowed(self, pose: np.ndarray) -> bool:
+        """SoftGym refuses a move as a whole if a corner would sink below the table or the cup would touch the target."""
+        outline = corners(self.cup.size, *pose)
+        return bool(outline[:, 1].min() >= -1e-9) and not overlap(outline, self._forbidden)
+
+    def _locate(self) -> None:
+        """Find out where each particle is; between control steps nothing moves."""
+        positions = self.water.positions()
+        in_cup = self.cup.contains(positions)
+        self._highest = positions[:, 2].max()
+        self.n_in_cup = int(in_cup.sum())
+        self.n_in_target = int((self.target.contains(positions) & ~in_cup).sum())
+
+    def _measure(self) -> np.ndarray:
+        cup, target, n = self.cup, self.target, len(self.water)
+        return np.array(
+            [
+                cup.x,
+                cup.z,
+                cup.angle,
+                cup.size.length,
+                cup.size.width,
+                cup.size.height,
+                target.x,
+                target.size.height,
+                target.size.length,
+                target.size.width,
+                self._highest,
+                self.n_in_target / n,
+                self.n_in_cup / n,
+            ]
+        )
+
+    def performance(self) -> float:
+        """Fraction of the particles that are in the target and not in the cup."""
+        return self.n_in_target / len(self.water)
+
+    def monotone(self) -> float:
+        """Water level of the target, as the fraction of the water that is in it."""
+        return self.n_in_target / len(self.water)

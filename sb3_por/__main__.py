@@ -1,0 +1,169 @@
+"""``python -m sb3_por``: what there is to do with runs and models."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_por.errors import UserError, check_known, exit_code
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> Any:
+        raise UserError(f"{message} ({self.prog} --help lists the arguments)")
+
+
+@dataclass(frozen=True)
+class Command:
+    """
+    A subcommand. What it needs is imported when it runs, so that ``--help`` is quick.
+
+    :param help: one line
+    :param example: arguments of a call that works
+    :param add_arguments: gives the arguments to its parser
+    :param run: carries it out
+    """
+
+    help: str
+    example: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], None]
+
+
+def _model_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--model", required=True, help="a .zip, a run folder (its best_model.zip), random, or expert")
+    parser.add_argument("--env", required=True, help="environment id")
+    parser.add_argument("--algo", help="algorithm that saved the model, if it cannot be told from the file")
+
+
+def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
+    _model_arguments(parser)
+    parser.add_argument("-n", "--n-episodes", type=int, default=20, help="held-out episodes (default 20)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
+    parser.add_argument("--json", action="store_true", help="print every episode as JSON")
+
+
+def _load(args: argparse.Namespace) -> tuple[Any, str | None]:
+    """The model that the arguments name and the statistics that normalise its observations."""
+    import softbody_envs  # noqa: F401  (registers its ids)
+
+    check_known("environment", args.env, gym.registry)
+    from sb3_por.reference import REFERENCES
+
+    if args.model in REFERENCES:
+        return REFERENCES[args.model](args.env), None
+    from sb3_por.loading import load_model, vec_normalize_file
+
+    return load_model(args.model, args.algo), vec_normalize_file(args.model, args.env)
+
+
+def _evaluate(args: argparse.Namespace) -> None:
+    from sb3_por.evaluation import evaluate
+
+    model, vec_normalize = _load(args)
+    evaluation = evaluate(model, args.env, args.n_episodes, args.seed, vec_normalize=vec_normalize)
+    if args.json:
+        print(json.dumps({"model": args.model, "env": args.env, "seed": args.seed, **evaluation.as_dict()}, indent=2))
+    else:
+        print(evaluation)
+
+
+def _enjoy_arguments(parser: argparse.ArgumentParser) -> None:
+    _model_arguments(parser)
+    parser.add_argument("-o", "--output", required=True, help="the film: .gif or .mp4")
+    parser.add_argument("-n", "--n-episodes", type=int, default=1, help="held-out episodes (default 1)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
+    parser.add_argument("--size", type=int, default=480, help="height and width in pixels (default 480)")
+
+
+def _enjoy(args: argparse.Namespace) -> None:
+    from sb3_por.film import check_film, film
+
+    check_film(args.output)
+    model, vec_normalize = _load(args)
+    print(film(model, args.env, args.output, args.n_episodes, args.seed, args.size, vec_normalize))
+    print(args.output)
+
+
+def _plot_arguments(parser: argparse.ArgumentParser) -> None:
+    from sb3_por.scores import METRICS
+
+    parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
+    parser.add_argument("-o", "--output", required=True, help="the figure: .png, .pdf or .svg")
+    parser.add_argument("--metric", choices=METRICS, default=METRICS[0], help=f"what to plot (default {METRICS[0]})")
+    parser.add_argument("--csv", help="write the table of scores here, too")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default 0)")
+
+
+def _plot(args: argparse.Namespace) -> None:
+    from sb3_por.files import check_output
+    from sb3_por.plots import plot
+    from sb3_por.scores import read_scores, write_csv
+
+    if args.csv:
+        check_output(args.csv, (".csv",))
+    scores = read_scores(args.paths)
+    for note in plot(scores, args.output, args.metric, seed=args.seed):
+        print(f"note: {note}", file=sys.stderr)
+    if args.csv:
+        write_csv(scores, args.csv)
+    print(args.output)
+
+
+COMMANDS = {
+    "evaluate": Command(
+        help="play held-out episodes and print the scores",
+        example="--model logs/sac_por/PourWater-v0_1 --env PourWater-v0 -n 20 --json",
+        add_arguments=_evaluate_arguments,
+        run=_evaluate,
+    ),
+    "enjoy": Command(
+        help="film a model at work",
+        example="--model logs/sac_por/PourWater-v0_1 --env PourWater-v0 -o pour.gif",
+        add_arguments=_enjoy_arguments,
+        run=_enjoy,
+    ),
+    "plot": Command(
+        help="draw learning curves: interquartile mean with 95 % stratified bootstrap intervals",
+        example="logs/sac_por logs/sac -o curve.png --csv scores.csv",
+        add_arguments=_plot_arguments,
+        run=_plot,
+    ),
+}
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = Parser(prog="python -m sb3_por", description=__doc__)
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    for name, command in COMMANDS.items():
+        subparser = subparsers.add_parser(
+            name,
+            help=command.help,
+            description=command.help,
+            epilog=f"example: python -m sb3_por {name} {command.example}",
+        )
+        command.add_arguments(subparser)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """
+    :param arguments: of the command, ``sys.argv[1:]`` if ``None``
+    :return: the exit code
+    """
+
+    def command() -> None:
+        args = _parse(arguments)
+        COMMANDS[args.command].run(args)
+
+    return exit_code(command, "python -m sb3_por")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,260 @@
+"""Evaluation on held-out variations with fixed seeds: the same episodes for every method, seed and checkpoint."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
+
+from sb3_por.errors import UserError, one_line
+from softbody_envs.registration import ENV_IDS
+from softbody_envs.variations import SPLITS
+
+#: Seed of the first evaluation episode; the k-th has this plus k.
+EVAL_SEED = 0
+
+
+class Model(Protocol):
+    """What can be evaluated: every SB3 model, and anything else with a space and a ``predict`` like theirs."""
+
+    observation_space: spaces.Space
+    action_space: spaces.Space
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
+        """See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.predict`."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """
+    What decides how an episode begins.
+
+    :param index: place in the evaluation
+    :param seed: passed to ``reset``
+    :param variation: index of the scene; ``None`` for environments that have no variations
+    """
+
+    index: int
+    seed: int
+    variation: int | None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """
+    One number an episode, in the order of the episodes, each a list of length ``n_episodes``.
+
+    :param normalized_performance: at the end of the episode; 0: as after reset, 1: perfect; NaN if not reported
+    :param returns: undiscounted sum of the rewards
+    :param successes: 1.0 or 0.0; NaN if the environment does not report success
+    :param lengths: steps
+    :param variations: index of the scene, or ``None``
+    """
+
+    normalized_performance: list[float]
+    returns: list[float]
+    successes: list[float]
+    lengths: list[int]
+    variations: list[int | None]
+
+    @property
+    def score(self) -> float:
+        """Mean normalized performance; mean return for environments that report none. Checkpoints are ranked by it."""
+        mean = float(np.mean(self.normalized_performance))
+        return float(np.mean(self.returns)) if np.isnan(mean) else mean
+
+    def as_dict(self) -> dict[str, Any]:
+        """Means and the single episodes, for JSON: ``None`` stands for NaN."""
+        lists = asdict(self)
+        means = {
+            "normalized_performance": np.mean(self.normalized_performance),
+            "return": np.mean(self.returns),
+            "success": np.mean(self.successes),
+            "length": np.mean(self.lengths),
+        }
+        plain = {name: [_none_for_nan(value) for value in values] for name, values in lists.items()}
+        return {"n_episodes": len(self.returns), "mean": {k: _none_for_nan(v) for k, v in means.items()}, "episodes": plain}
+
+    def __str__(self) -> str:
+        parts = [f"return {np.mean(self.returns):.3f} ± {np.std(self.returns):.3f}"]
+        if not np.isnan(np.mean(self.normalized_performance)):
+            performance = self.normalized_performance
+            parts.insert(0, f"normalized performance {np.mean(performance):.3f} ± {np.std(performance):.3f}")
+        if not np.isnan(np.mean(self.successes)):
+            parts.append(f"success {np.mean(self.successes):.0%}")
+        episodes = f"{len(self.returns)} episode{'s' if len(self.returns) > 1 else ''}"
+        return f"{', '.join(parts)}, length {np.mean(self.lengths):.0f} ({episodes})"
+
+
+class FixedEpisodes(gym.Wrapper):
+    """
+    Plays a given list of episodes in turn, whatever seed ``reset`` is called with; then begins again.
+
+    It makes SB3's vectorised environments, which reset themselves without a seed, play the same episodes each time.
+
+    :param env: the environment
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self._episodes: list[Episode] = [Episode(0, EVAL_SEED, None)]
+        self._next = 0
+
+    def play(self, episodes: list[Episode]) -> None:
+        """The next ``reset`` begins the first of these."""
+        self._episodes = episodes
+        self._next = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._current = self._episodes[self._next % len(self._episodes)]
+        self._next += 1
+        variation = self._current.variation
+        return self.env.reset(seed=self._current.seed, options=None if variation is None else {"variation": variation})
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        if not np.isfinite(action).all():
+            raise UserError(f"the model's action is {action}: its training has diverged, use an earlier checkpoint")
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, info | {"evaluation_episode": self._current.index}
+
+
+def evaluation_episodes(env_id: str, n_episodes: int, seed: int = EVAL_SEED) -> list[Episode]:
+    """The episodes of an evaluation: held-out variations 800, 801, ... with seeds ``seed``, ``seed + 1``, ..."""
+    held_out = SPLITS["eval"]
+    has_variations = env_id in ENV_IDS
+    return [Episode(k, seed + k, held_out[k % len(held_out)] if has_variations else None) for k in range(n_episodes)]
+
+
+def evaluation_kwargs(env_id: str) -> dict[str, Any]:
+    """What the constructor of an evaluation environment gets besides what the training environment gets."""
+    return {"split": "eval"} if env_id in ENV_IDS else {}
+
+
+def run_episodes(model: Model, env: VecEnv, episodes: list[Episode]) -> Evaluation:
+    """
+    Play episodes with a model's deterministic policy.
+
+    :param model: an SB3 model
+    :param env: environments, each inside ``Monitor`` and ``FixedEpisodes``, wrapped as the model's training environment
+    :param episodes: what to play, shared out among the environments
+    """
+    n_envs = env.num_envs
+    for i in range(n_envs):
+        # The share that evaluate_policy gives environment i: (n_episodes + i) // n_envs.
+        env.env_method("play", episodes[n_envs - 1 - i :: n_envs], indices=i)
+    infos: dict[int, dict[str, Any]] = {}
+
+    def collect(local_variables: dict[str, Any], _: dict[str, Any]) -> None:
+        if local_variables["done"]:
+            info = local_variables["info"]
+            infos[info["evaluation_episode"]] = info
+
+    evaluate_policy(model, env, len(episodes), deterministic=True, callback=collect, warn=False)
+    ordered = [infos[episode.index] for episode in episodes]
+    return Evaluation(
+        normalized_performance=[float(info.get("normalized_performance", np.nan)) for info in ordered],
+        returns=[float(info["episode"]["r"]) for info in ordered],
+        successes=[float(info.get("is_success", np.nan)) for info in ordered],
+        lengths=[int(info["episode"]["l"]) for info in ordered],
+        variations=[episode.variation for episode in episodes],
+    )
+
+
+def make_evaluation_env(
+    model: Model,
+    env_id: str,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_normalize: str | None = None,
+    wrapper: Callable[[gym.Env], gym.Env] | None = None,
+) -> VecEnv:
+    """
+    An environment that gives a model the observations it was trained on.
+
+    :param model: its ``observation_space`` says observation type, image size and number of stacked frames
+    :param env_id: a Gymnasium id
+    :param env_kwargs: for the environment's constructor; they win over what is read from the model
+    :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
+    :param wrapper: put around the bare environment
+    :raises UserError: if the environment cannot be made, or its spaces are not the model's
+    """
+    kwargs = _observation_kwargs(env_id, model.observation_space) | evaluation_kwargs(env_id) | (env_kwargs or {})
+
+    def make() -> gym.Env:
+        env = gym.make(env_id, **kwargs)
+        return FixedEpisodes(Monitor(wrapper(env) if wrapper is not None else env))
+
+    try:
+        env: VecEnv = DummyVecEnv([make])
+    except (TypeError, ValueError, gym.error.Error) as error:
+        raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
+    try:
+        if vec_normalize is not None:
+            env = VecNormalize.load(vec_normalize, env)
+            env.training = env.norm_reward = False
+        n_stack = _size(model.observation_space) // max(_size(env.observation_space), 1)
+        if n_stack > 1:
+            env = VecFrameStack(env, n_stack)
+        env = BaseAlgorithm._wrap_env(env, verbose=0, monitor_wrapper=False)  # channels first, as SB3 does in training
+        check_for_correct_spaces(env, model.observation_space, model.action_space)
+    except (ValueError, AssertionError) as error:
+        env.close()
+        raise UserError(f"the model was not trained on {env_id}: {one_line(error)}") from error
+    return env
+
+
+def evaluate(
+    model: Model,
+    env_id: str,
+    n_episodes: int = 20,
+    seed: int = EVAL_SEED,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_normalize: str | None = None,
+) -> Evaluation:
+    """
+    Evaluate a model's deterministic policy on held-out variations 800, 801, ...
+
+    :param model: an SB3 model; observation type and image size are read from its ``observation_space``
+    :param env_id: a Gymnasium id
+    :param n_episodes: number of episodes
+    :param seed: seed of the first episode; the k-th is reset with ``seed + k``
+    :param env_kwargs: for the environment's constructor
+    :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
+    :raises UserError: if the environment does not fit the model
+    """
+    if n_episodes < 1:
+        raise UserError(f"an evaluation needs at least 1 episode, got {n_episodes}")
+    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize)
+    try:
+        return run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))
+    finally:
+        env.close()
+
+
+def _observation_kwargs(env_id: str, space: spaces.Space) -> dict[str, Any]:
+    """What makes one of our environments give observations of a model's space."""
+    if env_id not in ENV_IDS:
+        return {}
+    image = space.spaces.get("image") if isinstance(space, spaces.Dict) else space
+    if image is None or not is_image_space(image, check_channels=False):
+        return {"obs_type": "state"}
+    # Channels first or last, the middle axis of a square image is its size.
+    return {"obs_type": "dict" if isinstance(space, spaces.Dict) else "pixels", "image_size": image.shape[1]}
+
+
+def _size(space: spaces.Space) -> int:
+    """Number of elements of an observation, 0 where that is no one number."""
+    return int(np.prod(space.shape)) if isinstance(space, spaces.Box) else 0
+
+
+def _none_for_nan(value: Any) -> Any:
+    if value is None or isinstance(value, int):
+        return value
+    return None if np.isnan(value) else float(value)

@@ -1,0 +1,75 @@
+"""A film of a model at work, as GIF or MP4."""
+
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+from gymnasium.wrappers import RenderCollection
+
+from sb3_por.errors import UserError
+from sb3_por.evaluation import EVAL_SEED, Evaluation, Model, evaluation_episodes, make_evaluation_env, run_episodes
+from sb3_por.files import atomic_write, check_output
+from softbody_envs.registration import ENV_IDS
+
+FORMATS = (".gif", ".mp4")
+
+
+def check_film(path: str | Path) -> Path:
+    """
+    :raises UserError: if a film cannot be written under this name
+    """
+    return check_output(path, FORMATS)
+
+
+def film(
+    model: Model,
+    env_id: str,
+    path: str | Path,
+    n_episodes: int = 1,
+    seed: int = EVAL_SEED,
+    size: int = 480,
+    vec_normalize: str | None = None,
+) -> Evaluation:
+    """
+    Film a model's deterministic policy on the first held-out episodes.
+
+    :param model: an SB3 model
+    :param env_id: a Gymnasium id
+    :param path: ``.gif`` or ``.mp4``
+    :param n_episodes: number of episodes, one after the other
+    :param seed: seed of the first episode
+    :param size: height and width in pixels, for environments that let it be chosen
+    :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
+    :return: how the model did
+    :raises UserError: if the environment does not fit the model or draws no images
+    """
+    path = check_film(path)
+    if n_episodes < 1:
+        raise UserError(f"a film needs at least 1 episode, got {n_episodes}")
+    kwargs: dict[str, Any] = {"render_mode": "rgb_array"} | ({"render_size": size} if env_id in ENV_IDS else {})
+    env = make_evaluation_env(model, env_id, kwargs, vec_normalize, lambda inner: RenderCollection(inner, reset_clean=False))
+    try:
+        fps = env.get_attr("metadata")[0].get("render_fps", 30)
+        evaluation = run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))
+        # The last frame is of the episode that the vectorised environment began when the last one ended.
+        frames = env.env_method("render")[0][:-1]
+    finally:
+        env.close()
+    write_film(path, frames, fps)
+    return evaluation
+
+
+def write_film(path: str | Path, frames: list[np.ndarray], fps: float) -> None:
+    """
+    :param path: ``.gif`` or ``.mp4``
+    :param frames: uint8 images, ``(height, width, 3)``, at least one
+    :param fps: frames a second
+    """
+    path = check_film(path)
+    with atomic_write(path) as temporary:
+        if path.suffix.lower() == ".gif":
+            imageio.mimwrite(temporary, frames, duration=1000 / fps, loop=0)
+        else:
+            # H.264 wants even sizes: other frames are scaled up to the next multiple of 2.
+            imageio.mimwrite(temporary, frames, fps=fps, macro_block_size=2)

@@ -1,0 +1,102 @@
+"""Load any saved model for use: find its algorithm, name what is wrong with the file, allocate no replay buffer."""
+
+import json
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import sb3_contrib
+import stable_baselines3
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_por import ALGORITHMS
+from sb3_por.errors import UserError, check_known, one_line
+from sb3_por.runs import read_settings
+
+#: name -> class of every algorithm whose models can be loaded
+LOADABLE: dict[str, type[BaseAlgorithm]] = {
+    **{name.lower(): getattr(stable_baselines3, name) for name in ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")},
+    **{name.lower(): getattr(sb3_contrib, name) for name in ("CrossQ", "TQC", "TRPO")},
+    **ALGORITHMS,
+}
+
+
+def load_model(path: str | Path, algo: str | None = None, device: str = "auto") -> BaseAlgorithm:
+    """
+    :param path: a model's ``.zip``, or a run folder, which stands for its ``best_model.zip``
+    :param algo: name of its algorithm; found from the file if ``None``
+    :param device: PyTorch device
+    :return: the model, ready to predict; its replay buffer holds one transition
+    :raises UserError: if the file is not a saved model, or not one of this algorithm
+    """
+    path = model_file(path)
+    data = read_data(path)
+    if algo is not None:
+        check_known("algorithm", algo, LOADABLE)
+        candidates = [algo]
+    else:
+        candidates = _candidates(path, data)
+    buffer = {"buffer_size": 1} if "buffer_size" in data else {}
+    problem: Exception | None = None
+    for name in candidates:
+        try:
+            return LOADABLE[name].load(path, device=device, **buffer)
+        # SB3 loads strictly: the wrong class fails on the names of the networks' parameters.
+        except (AssertionError, AttributeError, KeyError, RuntimeError, TypeError, ValueError, pickle.PickleError) as error:
+            problem = problem or error
+    if problem is None:
+        raise UserError(f"cannot tell which algorithm saved {path}; say --algo, one of {', '.join(LOADABLE)}")
+    raise UserError(f"{path} is not a model of {' or '.join(candidates)}: {one_line(problem)[:200]}") from problem
+
+
+def model_file(path: str | Path) -> Path:
+    """
+    :param path: a model's ``.zip``, or a run folder, which stands for its ``best_model.zip``
+    :raises UserError: if there is no such file
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "best_model.zip"
+    if not path.is_file():
+        raise UserError(f"there is no model {path}; give a .zip that train.py or model.save() wrote")
+    return path
+
+
+def vec_normalize_file(path: str | Path, env_id: str) -> str | None:
+    """The ``VecNormalize`` statistics that the zoo saved beside a model, if it was trained with them."""
+    statistics = model_file(path).parent / env_id / "vecnormalize.pkl"
+    return str(statistics) if statistics.is_file() else None
+
+
+def read_data(path: Path) -> dict[str, Any]:
+    """
+    :param path: a model's ``.zip``
+    :return: the attributes of the saved model; values that are not JSON as SB3 wrote them
+    :raises UserError: if the file is corrupt or was not saved by SB3
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():
+                raise UserError(f"{path} is corrupt: {damaged} in it cannot be read; use another checkpoint")
+            data = json.loads(archive.read("data"))
+            data["policy_class"], data["observation_space"], archive.getinfo("policy.pth")
+    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        raise UserError(f"{path} is corrupt or no .zip at all: {one_line(error)}; use another checkpoint") from error
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"{path} was not saved by Stable-Baselines3; give a .zip that model.save() wrote") from error
+    return data
+
+
+def _candidates(path: Path, data: dict[str, Any]) -> list[str]:
+    """Algorithms that may have saved a model: the one its run's settings name, then those with its policy class."""
+    module = data["policy_class"].get("__module__", "") if isinstance(data["policy_class"], dict) else ""
+    package = module.rpartition(".")[0]
+    names = [name for name, cls in LOADABLE.items() if cls.__module__.rpartition(".")[0] == package]
+    for settings in sorted(path.parent.glob("*/args.yml")):
+        recorded = read_settings(settings).get("algo")
+        if recorded in names:
+            names = [recorded] + [name for name in names if name != recorded]
+    return names

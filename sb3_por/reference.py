@@ -1,0 +1,69 @@
+"""The two ends of the scale as models: a policy that acts at random and the scripted expert of a task."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_por.errors import UserError, check_known, one_line
+from softbody_envs.registration import ENV_IDS
+
+
+class RandomModel:
+    """
+    Acts uniformly at random.
+
+    :param env_id: a Gymnasium id
+    :param seed: of the actions
+    """
+
+    def __init__(self, env_id: str, seed: int = 0) -> None:
+        self.observation_space, self.action_space = _spaces(env_id)
+        self.action_space.seed(seed)
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """One action for each of the observations."""
+        return np.stack([self.action_space.sample() for _ in observation]), state
+
+
+class ExpertModel:
+    """
+    Acts as the scripted expert of a task: the ceiling that a learner is measured against.
+
+    :param env_id: one of our environments
+    """
+
+    def __init__(self, env_id: str) -> None:
+        from softbody_envs.experts import make_expert
+
+        check_known("environment with an expert", env_id, ENV_IDS)
+        self.observation_space, self.action_space = _spaces(env_id)
+        self._make_expert = lambda: make_expert(env_id)
+        self._experts: list[Any] = []
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """One action for each of the state vectors."""
+        if len(self._experts) != len(observation):
+            self._experts = [self._make_expert() for _ in observation]
+        starts = np.zeros(len(observation), dtype=bool) if episode_start is None else episode_start
+        for expert, start in zip(self._experts, starts, strict=True):
+            if start:
+                expert.reset()
+        return np.stack([expert.act(vector) for expert, vector in zip(self._experts, observation, strict=True)]), state
+
+
+#: What ``--model`` takes besides files.
+REFERENCES = {"random": RandomModel, "expert": ExpertModel}
+
+
+def _spaces(env_id: str) -> tuple[gym.Space, gym.Space]:
+    try:
+        env = gym.make(env_id, **({"obs_type": "state"} if env_id in ENV_IDS else {}))
+    except gym.error.Error as error:
+        raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
+    env.close()
+    return env.observation_space, env.action_space

@@ -1,0 +1,73 @@
+"""A run's folder, in the RL Zoo's layout: where its files are and what its settings say."""
+
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_por.errors import UserError
+
+EVALUATIONS = "evaluations.npz"
+
+
+class _PlainDumper(yaml.SafeDumper):
+    """Writes YAML that every reader can read: what is no plain value becomes its ``repr``."""
+
+
+_PlainDumper.add_multi_representer(object, lambda dumper, value: dumper.represent_str(repr(value)))
+_PlainDumper.add_multi_representer(dict, lambda dumper, value: dumper.represent_dict(value))
+
+
+def write_settings(path: Path, settings: dict[str, Any]) -> None:
+    """Write ``args.yml`` or ``config.yml`` of a run as plain YAML."""
+    path.write_text(yaml.dump(settings, Dumper=_PlainDumper))
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """
+    :param path: ``args.yml`` or ``config.yml`` of a run
+    :return: what is in it; empty if there is none, or one of another writer, with Python objects in it
+    """
+    try:
+        return dict(yaml.safe_load(path.read_text()) or {})
+    except (yaml.YAMLError, OSError, TypeError, ValueError):
+        return {}
+
+
+def run_arguments(run: Path) -> dict[str, Any]:
+    """The command-line arguments of a run; empty if they were not recorded."""
+    files = sorted(run.glob("*/args.yml"))
+    return read_settings(files[0]) if files else {}
+
+
+def find_runs(paths: Iterable[str | Path]) -> list[Path]:
+    """
+    :param paths: run folders, or folders that hold some at any depth
+    :return: every folder with an ``evaluations.npz``, sorted
+    :raises UserError: if a path does not exist or holds no run
+    """
+    runs: set[Path] = set()
+    for path in map(Path, paths):
+        if not path.is_dir():
+            raise UserError(f"there is no folder {path}")
+        found = {file.parent for file in path.rglob(EVALUATIONS)}
+        if not found:
+            raise UserError(f"no run under {path}: none of its folders has an {EVALUATIONS}")
+        runs |= found
+    return sorted(runs)
+
+
+def current_commit() -> str:
+    """The commit of the checkout that this package runs from, ``+`` if files differ from it; empty without one."""
+    root = Path(__file__).parent.parent
+    if not (root / ".git").exists():
+        return ""
+    git = ["git", "-C", str(root)]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)
+        changed = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return commit.stdout.strip() + ("+" if changed.stdout.strip() else "")

@@ -1,0 +1,97 @@
+"""The table of scores: one row an evaluation, read from runs or from ``scores.csv``."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_por.errors import UserError, one_line
+from sb3_por.files import atomic_write
+from sb3_por.runs import EVALUATIONS, find_runs, run_arguments
+
+#: What identifies a run, and what an evaluation measures.
+RUN_KEYS = ["env", "algo", "seed"]
+METRICS = ["normalized_performance", "return", "success"]
+COLUMNS = [*RUN_KEYS, "step", *METRICS, "wall_clock_s", "commit"]
+
+
+def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
+    """
+    :param paths: run folders, folders that hold runs at any depth, and ``.csv`` files of scores, in any mixture
+    :return: one row an evaluation with the columns ``COLUMNS``, sorted; a metric that was not recorded is NaN
+    :raises UserError: if a path holds no scores, or two runs of one algorithm and environment have one seed
+    """
+    paths = [Path(path) for path in paths]
+    tables = [read_csv(path) for path in paths if path.suffix == ".csv"]
+    folders = [path for path in paths if path.suffix != ".csv"]
+    tables += [read_run(run) for run in find_runs(folders)]
+    scores = pd.concat(tables, ignore_index=True).sort_values([*RUN_KEYS, "step"], kind="stable", ignore_index=True)
+    doubled = scores[scores.duplicated([*RUN_KEYS, "step"])]
+    if len(doubled):
+        env, algo, seed = doubled.iloc[0][RUN_KEYS]
+        raise UserError(f"there are two runs of {algo} on {env} with seed {seed}; give one of them")
+    return scores
+
+
+def read_run(run: Path) -> pd.DataFrame:
+    """
+    :param run: a run folder; what its settings do not say is read from its path, ``<algo>/<env>_<n>``
+    :return: its rows of the table of scores; means over the episodes of each evaluation
+    :raises UserError: if its evaluations cannot be read
+    """
+    try:
+        with np.load(run / EVALUATIONS) as file:
+            arrays = {name: file[name] for name in file.files}
+        steps, returns = arrays["timesteps"], arrays["results"].mean(axis=1)
+    except (OSError, EOFError, KeyError, ValueError) as error:
+        raise UserError(f"cannot read {run / EVALUATIONS}: {one_line(error)}") from error
+    unknown = np.full(len(steps), np.nan)
+    arguments = run_arguments(run)
+    name, _, number = run.name.rpartition("_")
+    return pd.DataFrame(
+        {
+            "env": arguments.get("env", name or run.name),
+            "algo": arguments.get("algo", run.parent.name),
+            "seed": int(arguments.get("seed", number if number.isdigit() else 0)),
+            "step": steps.astype(int),
+            "normalized_performance": _episode_mean(arrays, "normalized_performance", unknown),
+            "return": returns,
+            "success": _episode_mean(arrays, "successes", unknown),
+            "wall_clock_s": arrays.get("wall_clock_s", unknown),
+            "commit": arguments.get("commit", ""),
+        },
+        columns=COLUMNS,
+    )
+
+
+def read_csv(path: Path) -> pd.DataFrame:
+    """
+    :param path: a file that :func:`write_csv` wrote, or one with its columns
+    :raises UserError: if it cannot be read or lacks a column
+    """
+    try:
+        scores = pd.read_csv(path, dtype={"env": str, "algo": str, "commit": str}, keep_default_na=True)
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {path}: {one_line(error)}") from error
+    missing = [column for column in [*RUN_KEYS, "step"] if column not in scores]
+    if missing:
+        raise UserError(f"{path} has no column {', '.join(missing)}; a table of scores has {','.join(COLUMNS)}")
+    scores = scores.reindex(columns=COLUMNS)
+    scores["commit"] = scores["commit"].fillna("")
+    for column in ("seed", "step"):
+        if not pd.api.types.is_integer_dtype(scores[column]):
+            raise UserError(f"{path}: the column {column} must hold integers")
+    for column in [*METRICS, "wall_clock_s"]:
+        scores[column] = pd.to_numeric(scores[column], errors="coerce")
+    return scores
+
+
+def write_csv(scores: pd.DataFrame, path: str | Path) -> None:
+    """Write a table of scores; reading it gives the same table."""
+    with atomic_write(path) as temporary:
+        scores.to_csv(temporary, index=False, columns=COLUMNS)
+
+
+def _episode_mean(arrays: dict[str, np.ndarray], name: str, otherwise: np.ndarray) -> np.ndarray:
+    return arrays[name].astype(float).mean(axis=1) if name in arrays else otherwise

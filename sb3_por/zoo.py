@@ -1,0 +1,300 @@
+"""
+The RL Zoo's ``train`` command with our algorithms and tasks, and with its known faults mended.
+
+Importing this module imports ``rl_zoo3``, which replaces Gymnasium's ``TimeLimit``: nothing else in the package does.
+"""
+
+import argparse
+import importlib
+import os
+import shutil
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import rl_zoo3.train
+import torch as th
+import yaml
+from gymnasium import spaces
+from rl_zoo3 import ALGOS
+from rl_zoo3.callbacks import SaveVecNormalizeCallback
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import StoreDict, get_latest_run_id
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import ProgressBarCallback
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv
+
+import softbody_envs  # noqa: F401  (registers its ids)
+from sb3_por import ALGORITHMS
+from sb3_por.callbacks import CheckpointCallback, EvaluationCallback
+from sb3_por.errors import UserError, check_known, exit_code, one_line
+from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs
+from sb3_por.files import atomic_write, check_writable
+from sb3_por.loading import model_file, read_data
+from sb3_por.runs import current_commit, write_settings
+
+EXAMPLE = """example:
+  python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:0.1 pairing:paper
+
+Settings come from zoo_hyperparams/<algo>.yml, else from the RL Zoo's file of the algorithm. The run goes to
+<log-folder>/<algo>/<env>_<n>: best_model.zip, evaluations.npz, checkpoints, tb/ for TensorBoard."""
+
+#: Our defaults of the zoo's flags, where they differ.
+DEFAULTS = {"algo": "sac_por", "env": "PourWater-v0", "eval_freq": 2000, "save_freq": 10_000}
+
+for _name, _class in ALGORITHMS.items():
+    ALGOS[_name] = _class
+    _base = "tqc" if _name.startswith("tqc") else "sac"
+    HYPERPARAMS_SAMPLER[_name], HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_SAMPLER[_base], HYPERPARAMS_CONVERTER[_base]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """
+    Train as the command line says.
+
+    :param arguments: of the command, ``sys.argv[1:]`` if ``None``
+    :return: the exit code
+    """
+    if arguments is not None:
+        sys.argv = ["train.py", *arguments]
+    # The zoo's train() has no hooks: it finds these three by name in its module.
+    rl_zoo3.train.argparse = types.SimpleNamespace(ArgumentParser=Parser)  # type: ignore[attr-defined]
+    rl_zoo3.train.StoreDict = Settings  # type: ignore[misc]
+    rl_zoo3.train.ExperimentManager = Experiment  # type: ignore[misc]
+    return exit_code(rl_zoo3.train.train, "train.py")
+
+
+class Settings(StoreDict):
+    """``key:value`` pairs whose values are Python, as in the zoo, or else plain words: ``pairing:paper``."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        stored: dict[str, Any] = {}
+        for pair in values:
+            one = argparse.Namespace()
+            try:
+                super().__call__(parser, one, [pair], option_string)
+                stored |= getattr(one, self.dest)
+            except (NameError, SyntaxError):
+                key, colon, word = pair.partition(":")
+                if not colon or not word:
+                    parser.error(f"{option_string} takes key:value pairs, got {pair!r}")
+                stored[key] = word
+        setattr(namespace, self.dest, stored)
+
+
+class Parser(argparse.ArgumentParser):
+    """The zoo's parser with our defaults; what cannot work is said before anything is made."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            prog="train.py", description=__doc__, epilog=EXAMPLE, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+
+    def error(self, message: str) -> Any:
+        raise UserError(f"{message} (train.py --help lists the flags)")
+
+    def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
+        if "--algo" in names:
+            del options["choices"]  # checked below, with the nearest name
+        return super().add_argument(*names, **options)
+
+    def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]
+        self.set_defaults(**DEFAULTS, progress=sys.stderr.isatty())
+        args = super().parse_args()
+        check_known("algorithm", args.algo, ALGOS)
+        for module in args.gym_packages:
+            try:
+                importlib.import_module(module)
+            except ImportError as error:
+                raise UserError(f"--gym-packages: {one_line(error)}") from error
+        check_known("environment", args.env, gym.registry)
+        if args.trained_agent:
+            args.trained_agent = str(model_file(args.trained_agent))
+            read_data(Path(args.trained_agent))
+        args.conf_file = args.conf_file or str(hyperparameter_file(args.algo, args.env))
+        if args.conf_file.endswith((".yml", ".yaml")):
+            _check_hyperparameters(Path(args.conf_file), args.env)
+        check_writable(args.log_folder)
+        args.commit = current_commit()
+        return args
+
+
+def hyperparameter_file(algo: str, env_id: str) -> Path:
+    """
+    The settings of an algorithm for an environment: ours where we list it, else the zoo's, else our default.
+
+    :raises UserError: if none fits
+    """
+    package = Path(__file__).parent
+    # At the top of a checkout; inside the package where it was installed without -e.
+    ours = next((f for f in (package.parent, package) if (f / "zoo_hyperparams").is_dir()), package) / "zoo_hyperparams"
+    files = [folder / f"{algo}.yml" for folder in (ours, Path(rl_zoo3.__file__).parent / "hyperparams")]
+    entries = {file: yaml.safe_load(file.read_text()) for file in files if file.is_file()}
+    for key in (env_id, "default"):
+        for file, settings in entries.items():
+            if key in settings:
+                return file
+    raise UserError(f"there are no settings of {algo} for {env_id}; write some and pass -conf FILE.yml")
+
+
+def _check_hyperparameters(file: Path, env_id: str) -> None:
+    try:
+        settings = yaml.safe_load(file.read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise UserError(f"cannot read {file}: {one_line(error)}") from error
+    if not isinstance(settings, dict) or not {env_id, "default"} & set(settings):
+        raise UserError(f"{file} has no entry {env_id} and no entry default")
+
+
+def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
+    """
+    :param policy: what the settings name
+    :raises UserError: if the policy cannot read the observations
+    """
+    needed = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "CnnPolicy" if is_image_space(space) else "MlpPolicy"
+    # MlpPolicy flattens images, which works, however badly.
+    fits = policy == needed or (policy == "MlpPolicy" and needed == "CnnPolicy")
+    if policy in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy") and not fits:
+        raise UserError(f"{policy} cannot read the observations of {env_id}, {space}; pass -params policy:{needed}")
+
+
+class Experiment(ExperimentManager):
+    """The zoo's manager of one run. Each method here mends one of its faults and says which."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._uuid = kwargs["uuid_str"]
+        self._folder_made = False
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """``--env-kwargs`` adds to the file's (the zoo's replaces them all), and evaluation gets them too."""
+        given, self.env_kwargs = self.env_kwargs, {}
+        hyperparams, saved = super().read_hyperparameters()
+        self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
+        held_out = evaluation_kwargs(self.env_name.gym_id)
+        self.eval_env_kwargs = {**self.env_kwargs, **held_out, **(self._eval_env_kwargs_args or {})}
+        return hyperparams, saved
+
+    def create_log_folder(self) -> None:
+        """The zoo looks for a free number and makes the folder later: runs started together would share it."""
+        while True:
+            run_id = get_latest_run_id(self.log_path, self.env_name) + 1
+            self.save_path = os.path.join(self.log_path, f"{self.env_name}_{run_id}{self._uuid}")
+            try:
+                os.makedirs(self.save_path, exist_ok=False)
+                break
+            except FileExistsError:
+                continue
+        self.params_path = os.path.join(self.save_path, self.env_name)
+        os.makedirs(self.params_path)
+        self._folder_made = True
+        if self.tensorboard_log is None and not self.optimize_hyperparameters:
+            self.tensorboard_log = os.path.join(self.save_path, "tb")
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """Settings that cannot work leave one line and no folder."""
+        try:
+            return super().setup_experiment()
+        except (AssertionError, TypeError, ValueError, RuntimeError, gym.error.Error) as error:
+            if self._folder_made:
+                shutil.rmtree(self.save_path, ignore_errors=True)
+            if isinstance(error, UserError) or self.verbose > 1:
+                raise
+            message = f"{self.algo} cannot be set up on {self.env_name.gym_id}: {one_line(error)} (--verbose 2 shows where)"
+            raise UserError(message) from error
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """Evaluation plays the same held-out episodes each time; the zoo's begin as the training environment does."""
+        if not eval_env:
+            return super().create_envs(n_envs, no_log=no_log)
+        inner = self.env_wrapper
+        self.env_wrapper = FixedEpisodes if inner is None else lambda env: FixedEpisodes(inner(env))
+        try:
+            return super().create_envs(n_envs, eval_env=True, no_log=no_log)
+        finally:
+            self.env_wrapper = inner
+
+    def create_callbacks(self) -> None:
+        """Our evaluation and checkpoints, counted in environment steps."""
+        if self.show_progress:
+            self.callbacks.append(ProgressBarCallback())
+        if self.save_freq > 0:
+            self.callbacks.append(CheckpointCallback(self.save_freq, self.save_path))
+        if self.eval_freq > 0 and not self.optimize_hyperparameters:
+            self.callbacks.append(
+                EvaluationCallback(
+                    self.create_envs(self.n_eval_envs, eval_env=True),
+                    evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes),
+                    self.eval_freq,
+                    self.save_path,
+                    callback_on_new_best=SaveVecNormalizeCallback(save_freq=1, save_path=self.params_path),
+                    verbose=self.verbose,
+                )
+            )
+
+    def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> dict[str, Any]:
+        """The zoo's last step before it builds the model: see that the policy fits the observations."""
+        check_policy(hyperparams.get("policy"), env.observation_space, self.env_name.gym_id)
+        return super()._preprocess_action_noise(hyperparams, saved, env)
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        """Plain YAML; the zoo writes Python objects, which only an unsafe loader reads."""
+        write_settings(Path(self.params_path) / "config.yml", dict(sorted(saved_hyperparams.items())))
+        write_settings(Path(self.params_path) / "args.yml", dict(sorted(vars(self.args).items())))
+        (Path(self.params_path) / "command.txt").write_text(" ".join(sys.orig_argv))
+        print(f"Log path: {self.save_path}")
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """A resumed run goes on counting: the zoo's would repeat its schedules and its random warm-up."""
+        kwargs: dict[str, Any] = {"callback": self.callbacks, "reset_num_timesteps": not self.continue_training}
+        if self.log_interval != -1:
+            kwargs["log_interval"] = self.log_interval if self.log_interval > -1 else None
+        try:
+            model.learn(self.n_timesteps, **kwargs)
+        except KeyboardInterrupt:
+            print(f"Interrupted at step {model.num_timesteps}: the model is saved.", file=sys.stderr)
+        except ValueError as error:
+            if _is_finite(model):
+                raise
+            raise UserError(
+                f"training diverged before step {model.num_timesteps}: the networks hold NaN. What was saved in "
+                f"{self.save_path} before is sound; a lower learning_rate may help"
+            ) from error
+        finally:
+            self._close(model)
+
+    def _close(self, model: BaseAlgorithm) -> None:
+        for callback in self.callbacks:
+            if isinstance(callback, ProgressBarCallback) and hasattr(callback, "pbar"):
+                callback.pbar.close()
+            if isinstance(callback, EvaluationCallback):
+                callback.eval_env.close()
+        if model.env is not None:
+            model.env.close()
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """Files are whole or absent."""
+        save: Callable[[Path], Any] = model.save
+        with atomic_write(Path(self.save_path) / f"{self.env_name}.zip") as path:
+            save(path)
+        if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
+            with atomic_write(Path(self.save_path) / "replay_buffer.pkl") as path:
+                model.save_replay_buffer(path)
+        statistics = model.get_vec_normalize_env()
+        if statistics is not None:
+            statistics.save(os.path.join(self.params_path, "vecnormalize.pkl"))
+        print(f"Saved to {self.save_path}")
+
+
+def _is_finite(model: BaseAlgorithm) -> bool:
+    return all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

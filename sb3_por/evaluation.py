@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -121,7 +122,7 @@ class FixedEpisodes(gym.Wrapper):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         if not np.isfinite(action).all():
-            raise UserError(f"the model's action is {action}: its training has diverged, use an earlier checkpoint")
+            raise UserError(f"the model's action is {action}, not finite; use an earlier checkpoint")
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, reward, terminated, truncated, info | {"evaluation_episode": self._current.index}
 
@@ -138,6 +139,12 @@ def evaluation_kwargs(env_id: str) -> dict[str, Any]:
     return {"split": "eval"} if env_id in ENV_IDS else {}
 
 
+def has_diverged(model: Model) -> bool:
+    """Whether a parameter of the model's networks is NaN or infinite."""
+    policy = getattr(model, "policy", None)
+    return policy is not None and not all(bool(th.isfinite(parameter).all()) for parameter in policy.parameters())
+
+
 def run_episodes(model: Model, env: VecEnv, episodes: list[Episode]) -> Evaluation:
     """
     Play episodes with a model's deterministic policy.
@@ -145,7 +152,10 @@ def run_episodes(model: Model, env: VecEnv, episodes: list[Episode]) -> Evaluati
     :param model: an SB3 model
     :param env: environments, each inside ``Monitor`` and ``FixedEpisodes``, wrapped as the model's training environment
     :param episodes: what to play, shared out among the environments
+    :raises UserError: if the model's training has diverged
     """
+    if has_diverged(model):
+        raise UserError("the model's networks hold NaN: its training has diverged; use an earlier checkpoint")
     n_envs = env.num_envs
     for i in range(n_envs):
         # The share that evaluate_policy gives environment i: (n_episodes + i) // n_envs.

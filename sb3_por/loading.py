@@ -1,5 +1,6 @@
 """Load any saved model for use: find its algorithm, name what is wrong with the file, allocate no replay buffer."""
 
+import inspect
 import json
 import pickle
 import zipfile
@@ -91,12 +92,18 @@ def read_data(path: Path) -> dict[str, Any]:
 
 
 def _candidates(path: Path, data: dict[str, Any]) -> list[str]:
-    """Algorithms that may have saved a model: the one its run's settings name, then those with its policy class."""
-    module = data["policy_class"].get("__module__", "") if isinstance(data["policy_class"], dict) else ""
-    package = module.rpartition(".")[0]
-    names = [name for name, cls in LOADABLE.items() if cls.__module__.rpartition(".")[0] == package]
-    for settings in sorted(path.parent.glob("*/args.yml")):
-        recorded = read_settings(settings).get("algo")
-        if recorded in names:
-            names = [recorded] + [name for name in names if name != recorded]
-    return names
+    """
+    Algorithms that may have saved a model, the likeliest first: those with its policy class; among them the one that
+    its run's settings name; then those that have most of their constructor's arguments in the file.
+    """
+    recorded = {read_settings(settings).get("algo") for settings in path.parent.glob("*/args.yml")}
+    module = data["policy_class"].get("__module__") if isinstance(data["policy_class"], dict) else None
+
+    def unlikeliness(name: str) -> tuple[bool, int, int]:
+        arguments = set(inspect.signature(LOADABLE[name].__init__).parameters)
+        return name not in recorded, len(arguments - set(data)), -len(arguments)
+
+    names = [
+        name for name, cls in LOADABLE.items() if any(policy.__module__ == module for policy in cls.policy_aliases.values())
+    ]
+    return sorted(names, key=unlikeliness)

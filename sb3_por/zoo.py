@@ -15,9 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import rl_zoo3.train
-import torch as th
 import yaml
 from gymnasium import spaces
 from rl_zoo3 import ALGOS
@@ -34,7 +32,7 @@ import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import ALGORITHMS
 from sb3_por.callbacks import CheckpointCallback, EvaluationCallback
 from sb3_por.errors import UserError, check_known, exit_code, one_line
-from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs
+from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged
 from sb3_por.files import atomic_write, check_writable
 from sb3_por.loading import model_file, read_data
 from sb3_por.runs import current_commit, write_settings
@@ -260,7 +258,7 @@ class Experiment(ExperimentManager):
         except KeyboardInterrupt:
             print(f"Interrupted at step {model.num_timesteps}: the model is saved.", file=sys.stderr)
         except ValueError as error:
-            if _is_finite(model):
+            if not has_diverged(model):
                 raise
             raise UserError(
                 f"training diverged before step {model.num_timesteps}: the networks hold NaN. What was saved in "
@@ -290,10 +288,6 @@ class Experiment(ExperimentManager):
         if statistics is not None:
             statistics.save(os.path.join(self.params_path, "vecnormalize.pkl"))
         print(f"Saved to {self.save_path}")
-
-
-def _is_finite(model: BaseAlgorithm) -> bool:
-    return all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
 
 
 if __name__ == "__main__":

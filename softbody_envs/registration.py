@@ -5,6 +5,7 @@ import gymnasium as gym
 #: id -> (module:class under ``softbody_envs.tasks``, horizon in control steps of 0.08 s)
 _TABLE = {
     "PourWater-v0": ("pour_water:PourWaterEnv", 100),
+    "PourWaterAmount-v0": ("pour_water_amount:PourWaterAmountEnv", 100),
 }
 
 #: Every id that ``import softbody_envs`` registers.

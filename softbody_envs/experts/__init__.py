@@ -22,6 +22,7 @@ class Expert(Protocol):
 #: id -> module:class under ``softbody_envs.experts``
 _TABLE = {
     "PourWater-v0": "pour_water:PourWaterExpert",
+    "PourWaterAmount-v0": "pour_water:PourWaterAmountExpert",
 }
 
 

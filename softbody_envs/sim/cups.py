@@ -90,18 +90,26 @@ class Cup:
         self._world.client.resetBasePositionAndOrientation(self._body, (x, 0, z), orientation)
         self._world.client.resetBaseVelocity(self._body, velocity, spin)
 
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """
+        :param points: m, ``(n, 3)``
+        :return: the same points in the cup's frame, m, ``(n, 3)``
+        """
+        x, y, z = (points - (self.x, 0.0, self.z)).T
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        return np.stack([cos * x - sin * z, y, sin * x + cos * z], axis=1)
+
     def contains(self, points: np.ndarray) -> np.ndarray:
         """
-        Which points lie in the cavity, however the cup is tilted.
+        Which points lie in the cavity, however the cup is tilted. Half a wall counts as cavity, as in SoftGym: a particle
+        that hits the wall is a little inside it for a moment.
 
         :param points: m, ``(n, 3)``
         :return: bool ``(n,)``
         """
-        x, y, z = (points - (self.x, 0.0, self.z)).T
-        cos, sin = np.cos(self.angle), np.sin(self.angle)
-        x, z = cos * x - sin * z, sin * x + cos * z
-        half_x, half_y = self.size.length / 2, self.size.width / 2
-        return (np.abs(x) <= half_x) & (np.abs(y) <= half_y) & (z >= WALL) & (z <= self.size.outer_height)
+        x, y, z = np.abs(self.local(points) - (0.0, 0.0, WALL + self.size.height / 2)).T
+        half = np.array([self.size.length, self.size.width, self.size.height]) / 2 + WALL / 2
+        return (x <= half[0]) & (y <= half[1]) & (z <= half[2])
 
 
 def corners(size: CupSize, x: float, z: float, angle: float) -> np.ndarray:

@@ -8,6 +8,8 @@ from softbody_envs.sim.world import World
 #: Particle radius, m.
 RADIUS = 0.02
 DIAMETER = 2 * RADIUS
+#: Volume of a particle, m^3.
+VOLUME = 4 / 3 * np.pi * RADIUS**3
 DENSITY = 1000.0
 #: SoftGym's fluid colour.
 COLOR = (0.113, 0.425, 0.55, 1.0)
@@ -23,7 +25,7 @@ class Water:
         self._world = world
         client = world.client
         self._bodies = client.createMultiBody(
-            baseMass=DENSITY * 4 / 3 * np.pi * RADIUS**3,
+            baseMass=DENSITY * VOLUME,
             baseCollisionShapeIndex=client.createCollisionShape(pybullet.GEOM_SPHERE, radius=RADIUS),
             baseVisualShapeIndex=client.createVisualShape(pybullet.GEOM_SPHERE, radius=RADIUS, rgbaColor=COLOR),
             basePosition=(0, 0, 0),

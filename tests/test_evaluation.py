@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import PPO, SAC, TD3
+from sb3_contrib import TQC
+from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
@@ -154,7 +155,7 @@ def test_algorithm_is_found_from_the_file(pendulum_zip, tmp_path, pendulum_model
     assert np.array_equal(
         loaded.predict(observation, deterministic=True)[0], pendulum_model.predict(observation, deterministic=True)[0]
     )
-    for cls in (PPO, TD3):
+    for cls in (A2C, PPO, TD3, TQC):
         cls("MlpPolicy", "Pendulum-v1").save(tmp_path / "model.zip")
         assert type(load_model(tmp_path / "model.zip")) is cls
 

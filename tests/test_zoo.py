@@ -1,0 +1,222 @@
+"""train.py: the zoo's command with our algorithms, tasks, evaluation and messages."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import rl_zoo3
+import yaml
+from rl_zoo3.utils import get_saved_hyperparams, get_trained_models
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_por import ALGORITHMS
+from sb3_por.errors import UserError
+from sb3_por.loading import load_model
+from sb3_por.scores import read_scores
+from sb3_por.zoo import Experiment, check_policy, hyperparameter_file, main
+
+ROOT = Path(__file__).parent.parent
+PENDULUM = ["--algo", "sac", "--env", "Pendulum-v1", "--eval-episodes", "2", "--seed", "1", "--num-threads", "1"]
+SMALL = ["-params", "learning_starts:50", "buffer_size:1000", "batch_size:16"]
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory):
+    """A run of SAC on Pendulum: 400 steps, evaluated at 150, 300 and the end, checkpoints at 200 and 400."""
+    folder = tmp_path_factory.mktemp("logs")
+    flags = ["-n", "400", "--eval-freq", "150", "--save-freq", "200", "--save-replay-buffer", "-f", str(folder)]
+    assert main([*PENDULUM, *flags, *SMALL]) == 0
+    return folder / "sac" / "Pendulum-v1_1"
+
+
+def test_a_run_leaves_the_zoos_files(finished_run):
+    files = {str(path.relative_to(finished_run)) for path in finished_run.rglob("*") if path.is_file()}
+    assert files >= {
+        "0.monitor.csv",
+        "Pendulum-v1.zip",
+        "best_model.zip",
+        "evaluations.npz",
+        "replay_buffer.pkl",
+        "rl_model_200_steps.zip",
+        "rl_model_400_steps.zip",
+        "Pendulum-v1/args.yml",
+        "Pendulum-v1/config.yml",
+        "Pendulum-v1/command.txt",
+    }
+    assert list(finished_run.glob("tb/SAC_1/events*"))
+    assert not [name for name in files if name.startswith(".")]
+    assert load_model(finished_run / "Pendulum-v1.zip").num_timesteps == 400
+
+
+def test_settings_are_plain_yaml_that_the_zoo_reads(finished_run):
+    args = yaml.safe_load((finished_run / "Pendulum-v1" / "args.yml").read_text())
+    assert (args["algo"], args["env"], args["seed"], args["n_timesteps"]) == ("sac", "Pendulum-v1", 1, 400)
+    config = yaml.safe_load((finished_run / "Pendulum-v1" / "config.yml").read_text())
+    assert config["learning_starts"] == 50 and config["policy"] == "MlpPolicy"
+    assert get_trained_models(str(finished_run.parent.parent)) == {"sac-Pendulum-v1": ("sac", "Pendulum-v1")}
+    assert get_saved_hyperparams(str(finished_run / "Pendulum-v1"))[0]["normalize"] is False
+
+
+def test_evaluations_are_regular_and_include_the_end(finished_run):
+    with np.load(finished_run / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [150, 300, 400]
+        assert file["results"].shape == file["ep_lengths"].shape == file["normalized_performance"].shape == (3, 2)
+        assert (file["ep_lengths"] == 200).all() and (np.diff(file["wall_clock_s"]) > 0).all()
+        best = file["results"].mean(axis=1).argmax()
+    assert load_model(finished_run / "best_model.zip").num_timesteps == [150, 300, 400][best]
+    rows = read_scores([finished_run])
+    assert rows["algo"].tolist() == ["sac"] * 3 and rows["seed"].tolist() == [1] * 3
+
+
+def test_a_resumed_run_goes_on_counting_without_a_second_warm_up(finished_run, tmp_path, monkeypatch):
+    sampled = []
+    original = SAC._sample_action
+
+    def sample(self, learning_starts, *args, **kwargs):
+        sampled.append(self.num_timesteps < learning_starts)
+        return original(self, learning_starts, *args, **kwargs)
+
+    monkeypatch.setattr(SAC, "_sample_action", sample)
+    flags = ["-n", "60", "--eval-freq", "-1", "-i", str(finished_run / "Pendulum-v1.zip"), "-f", str(tmp_path)]
+    assert main([*PENDULUM, *flags, *SMALL]) == 0
+    model = load_model(tmp_path / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip")
+    assert model.num_timesteps == 460 and model._total_timesteps == 460
+    assert len(sampled) == 60 and not any(sampled)
+
+
+def test_env_kwargs_add_to_the_files_and_reach_the_evaluation(tmp_path, monkeypatch):
+    made = []
+    original = gym.envs.registration.EnvSpec.make
+    monkeypatch.setattr(
+        gym.envs.registration.EnvSpec, "make", lambda spec, **kwargs: made.append(kwargs) or original(spec, **kwargs)
+    )
+    flags = ["--algo", "sac", "-n", "20", "--eval-freq", "20", "--eval-episodes", "1", "-f", str(tmp_path)]
+    assert main([*flags, "--env-kwargs", "renderer:tiny", "--seed", "1"]) == 0
+    train, held_out = sorted(made, key=lambda kwargs: "split" in kwargs)
+    assert train == {"obs_type": "state", "renderer": "tiny"}
+    assert held_out == {"obs_type": "state", "renderer": "tiny", "split": "eval"}
+    with np.load(tmp_path / "sac" / "PourWater-v0_1" / "evaluations.npz") as file:
+        assert np.isfinite(file["normalized_performance"]).all() and file["successes"].shape == (1, 1)
+
+
+def test_runs_started_together_get_folders_of_their_own(tmp_path, monkeypatch):
+    """As seen by two runs of which the second looks for a free number before the first has made its folder."""
+    experiments = [Experiment.__new__(Experiment) for _ in range(2)]
+    monkeypatch.setattr("sb3_por.zoo.get_latest_run_id", lambda *_: numbers.pop(0))
+    numbers = [0, 0, 1]
+    for experiment in experiments:
+        experiment.log_path, experiment.env_name, experiment._uuid = str(tmp_path), "E-v0", ""
+        experiment.tensorboard_log, experiment.optimize_hyperparameters = None, False
+        experiment.create_log_folder()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["E-v0_1", "E-v0_2"]
+    assert experiments[1].tensorboard_log == str(tmp_path / "E-v0_2" / "tb")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--algo", "sac_pro"], "unknown algorithm 'sac_pro'; did you mean sac_por?"),
+        (["--env", "pourwater-v0"], "unknown environment 'pourwater-v0'; did you mean PourWater-v0?"),
+        (["--nonsense"], "unrecognized arguments: --nonsense"),
+        (["--algo", "sac", "--env", "CartPole-v1"], "action spaces but Discrete(2) was provided"),
+        (["--algo", "sac", "-params", "policy:CnnPolicy"], "pass -params policy:MlpPolicy"),
+        (["--algo", "sac", "-params", "colour:blue"], "unexpected keyword argument 'colour'"),
+        (["--algo", "sac", "-params", "learning_rate"], "-params takes key:value pairs, got 'learning_rate'"),
+        (["--algo", "sac", "--env-kwargs", "obs_type:sound"], "obs_type must be one of pixels, state, dict, got 'sound'"),
+        (["--algo", "sac", "-conf", "missing.yml"], "cannot read missing.yml"),
+        (["--algo", "sac", "-i", "missing.zip"], "there is no model missing.zip"),
+        (["--algo", "sac", "-i", __file__], "corrupt or no .zip at all"),
+        (["--gym-packages", "no_such_package"], "No module named 'no_such_package'"),
+        (["-f", "/proc/logs"], "cannot write in /proc/logs"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_no_run(flags, message, tmp_path, capsys):
+    assert main(["-n", "10", "-f", str(tmp_path), *flags]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    said = [line for line in lines if line.startswith("train.py: error: ")]
+    assert len(said) == 1 and said == lines[-1:] and message in said[0]
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not list(tmp_path.glob("*/*_*"))
+
+
+def test_training_that_diverges_is_one_line_and_keeps_the_checkpoints(tmp_path, capsys):
+    flags = ["-n", "300", "--eval-freq", "60", "--save-freq", "60", "-f", str(tmp_path)]
+    small = ["-params", "learning_starts:70", "buffer_size:1000", "batch_size:16", "learning_rate:1e30"]
+    assert main([*PENDULUM, *flags, *small]) == 2
+    assert "diverged" in capsys.readouterr().err.splitlines()[-1]
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    assert load_model(run / "rl_model_60_steps.zip").num_timesteps == 60
+    assert load_model(run / "best_model.zip").num_timesteps == 60
+
+
+def test_ctrl_c_saves_the_model(tmp_path, capsys, monkeypatch):
+    class Interrupt(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 30:
+                raise KeyboardInterrupt
+            return True
+
+    create = Experiment.create_callbacks
+    monkeypatch.setattr(Experiment, "create_callbacks", lambda self: (create(self), self.callbacks.append(Interrupt())))
+    assert main([*PENDULUM, "-n", "400", "-f", str(tmp_path), *SMALL]) == 0
+    assert "Interrupted at step 30: the model is saved." in capsys.readouterr().err
+    assert load_model(tmp_path / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip").num_timesteps == 30
+
+
+def test_settings_are_ours_then_the_zoos_then_our_default():
+    ours, zoo = ROOT / "zoo_hyperparams", Path(rl_zoo3.__file__).parent / "hyperparams"
+    assert hyperparameter_file("sac", "PourWater-v0") == ours / "sac.yml"
+    assert hyperparameter_file("sac", "Pendulum-v1") == zoo / "sac.yml"
+    assert hyperparameter_file("sac_por", "MyPixels-v0") == ours / "sac_por.yml"
+    assert hyperparameter_file("sac", "MyStates-v0") == zoo / "sac.yml"
+    with pytest.raises(UserError, match="no settings of her for MyStates-v0"):
+        hyperparameter_file("her", "MyStates-v0")
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "zoo_hyperparams").rglob("*.yml")), ids=lambda file: file.stem)
+def test_hyperparameter_files_hold_numbers_where_they_mean_numbers(file):
+    for name, settings in yaml.safe_load(file.read_text()).items():
+        assert settings["n_timesteps"] > 0, name
+        for key, value in settings.items():
+            # PyYAML reads 1e-3, without a point, as a string.
+            assert not (isinstance(value, str) and value[:1].isdigit()), f"{name}: {key} is the string {value!r}"
+
+
+@pytest.mark.parametrize("algo", sorted(ALGORITHMS))
+def test_every_algorithm_has_settings(algo):
+    assert hyperparameter_file(algo, "PourWater-v0") == ROOT / "zoo_hyperparams" / f"{algo}.yml"
+
+
+def test_policies_are_checked_against_observations():
+    image = gym.spaces.Box(0, 255, (40, 40, 3), np.uint8)
+    vector = gym.spaces.Box(-1, 1, (3,), np.float32)
+    many = gym.spaces.MultiDiscrete([2, 2])
+    for policy, space in (("CnnPolicy", vector), ("CnnPolicy", many), ("MultiInputPolicy", image)):
+        with pytest.raises(UserError, match=f"{policy} cannot read the observations of E-v0"):
+            check_policy(policy, space, "E-v0")
+    check_policy("CnnPolicy", image, "E-v0")
+    check_policy("MlpPolicy", image, "E-v0")
+    check_policy("MultiInputPolicy", gym.spaces.Dict({"image": image}), "E-v0")
+
+
+def test_help_has_an_example_and_our_defaults():
+    shown = subprocess.run([sys.executable, "train.py", "--help"], cwd=ROOT, capture_output=True, text=True)
+    assert shown.returncode == 0 and "python train.py --algo sac_por --env PourWater-v0" in shown.stdout
+
+
+def test_por_trains_on_pouring_from_the_command_line(tmp_path):
+    flags = ["-n", "60", "--eval-freq", "60", "--eval-episodes", "1", "--seed", "1", "--num-threads", "1", "-f", str(tmp_path)]
+    small = ["-params", "learning_starts:40", "batch_size:8", "buffer_size:100", "pairing:paper"]
+    command = [sys.executable, "train.py", "--algo", "sac_por", "--env", "PourWater-v0", *flags, *small]
+    done = subprocess.run([*command, "--env-kwargs", "image_size:40"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "Step 60: normalized performance" in done.stdout
+    run = tmp_path / "sac_por" / "PourWater-v0_1"
+    model = load_model(run)
+    assert type(model) is ALGORITHMS["sac_por"] and model.pairing == "paper"
+    assert model.observation_space.shape == (3, 40, 40)
+    assert len(read_scores([run])) == 1

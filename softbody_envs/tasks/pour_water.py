@@ -21,6 +21,79 @@ SETTLE_STEPS = 8
 
 
 class PourWaterEnv(SoftbodyEnv):
+    """
+    ## Description
+
+    A cup of water stands beside a higher one. Lift the first, bring its spout over the other, and tilt it until all the
+    water is in the target. The water is 40 to 80 frictionless spheres of 2 cm radius; both cups are drawn without their
+    front wall, which is there.
+
+    ## Action Space
+
+    `Box(-1, 1, (3,), float32)`, a velocity held for one control step of 0.08 s:
+
+    | Num | Action | Largest change in one step |
+    |-----|--------|----------------------------|
+    | 0 | move along x, toward the target | 0.08 m |
+    | 1 | move up | 0.08 m |
+    | 2 | tilt toward the target | 0.12 rad |
+
+    The step is made of ten equal moves. A move is refused as a whole if a corner of the cup would sink below the height
+    at which it started, or if the cup would come nearer to the target than one particle's diameter (4 cm). On the table,
+    then, the cup cannot be tilted. Pose limits: x from -0.3 m to 0.3 m beyond the target, height 0 to 0.75 m, tilt
+    -pi to pi.
+
+    ## Observation Space
+
+    `obs_type="pixels"`: an RGB image. `obs_type="state"`: `Box(-10, 10, (13,), float32)`:
+
+    | Num | Observation | Unit |
+    |-----|-------------|------|
+    | 0, 1 | position of the cup's underside: x, height | m |
+    | 2 | tilt of the cup, positive toward the target | rad |
+    | 3, 4, 5 | inner length (x), inner width (y) and height of the cup | m |
+    | 6 | x of the target | m |
+    | 7, 8, 9 | height, inner length (x) and inner width (y) of the target | m |
+    | 10 | height of the highest particle | m |
+    | 11 | fraction of the water that is in the target | 1 |
+    | 12 | fraction of the water that is in the cup | 1 |
+
+    ## Rewards
+
+    Each step: the number of particles that are in the target and not in the cup, divided by the number of particles.
+
+    `performance` is this reward; `normalized_performance` = (performance - initial) / (1 - initial); `is_success` from
+    0.9 on; `monotone` is the fraction of the water in the target.
+
+    ## Starting State
+
+    The water at rest in the upright cup at x = 0. A variation draws the cup's floor (4 to 6 by 3 to 4 particles), the
+    number of particles (40 to 80), the cup's height (1.15 to 1.6 times the water's, and 2 cm), how much longer, wider and
+    higher the target is (up to 4, 4 and 10 cm), and the gap between the cups (6 to 20 cm).
+
+    ## Episode End
+
+    Truncation after 100 steps (8 s). There is no termination.
+
+    ## Arguments
+
+    See `SoftbodyEnv`.
+
+    ## Differences from SoftGym
+
+    * Spheres of 2 cm instead of some thousand FleX particles: coarse water, which leaves a tilted cup in surges.
+    * The cup keeps one particle's diameter from the target, and spilled water falls into a sink 10 cm lower: nothing can
+      be pressed through a wall. SoftGym lets cups touch and leaves the water on the table.
+    * A pose has limits, so that the cup stays in the image.
+    * Element 6 of the state is the target's place; SoftGym adds the cup's to it.
+    * Whether water is in a tilted cup is asked in the cup's frame; SoftGym takes an upright box.
+    * Cups never overlap at the start (in SoftGym in 0.7 % of the variations).
+
+    ## Version History
+
+    * v0: initial version
+    """
+
     camera: ClassVar[Camera] = Camera(position=(0.22, -1.30, 0.85), target=(0.22, 0.0, 0.31))
     action_size: ClassVar[int] = 3
     state_names: ClassVar[tuple[str, ...]] = (

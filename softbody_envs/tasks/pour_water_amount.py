@@ -15,6 +15,67 @@ PACKING = 0.55
 
 
 class PourWaterAmountEnv(PourWaterEnv):
+    """
+    ## Description
+
+    As PourWater, but only up to the red line on the target's back wall. What has been poured cannot be taken back.
+
+    ## Action Space
+
+    That of PourWater: `Box(-1, 1, (3,), float32)`.
+
+    | Num | Action | Largest change in one step |
+    |-----|--------|----------------------------|
+    | 0 | move along x, toward the target | 0.08 m |
+    | 1 | move up | 0.08 m |
+    | 2 | tilt toward the target | 0.12 rad |
+
+    ## Observation Space
+
+    `obs_type="pixels"`: an RGB image. `obs_type="state"`: `Box(-10, 10, (15,), float32)`, the 13 elements of PourWater and
+
+    | Num | Observation | Unit |
+    |-----|-------------|------|
+    | 13 | height of the line | m |
+    | 14 | wanted fraction of the water | 1 |
+
+    ## Rewards
+
+    Each step: minus the distance between the wanted number of particles and the number in the target, divided by the
+    number of all particles; from -1 to 0.
+
+    `performance` is this reward; `normalized_performance` = (performance - initial) / (0 - initial), so that the wanted
+    amount scores 1, an untouched scene 0, and twice the wanted amount 0; `is_success` from 0.9 on; `monotone` is the
+    fraction of the water in the target.
+
+    ## Starting State
+
+    That of PourWater. Each variation draws the wanted fraction from U(0.2, 1), rounded down to whole particles; the line
+    is where so many spheres, loosely packed, fill the target.
+
+    ## Episode End
+
+    Truncation after 100 steps (8 s). There is no termination.
+
+    ## Arguments
+
+    See `SoftbodyEnv`.
+
+    ## Differences from SoftGym
+
+    Those of PourWater, and:
+
+    * SoftGym normalizes as if the best performance were 1, though it is 0: its score ends at t / (1 + t) for the fraction
+      t. Here it ends at 1.
+    * SoftGym draws one fraction for all its variations. Here each has its own.
+    * The state keeps the fractions of water in target and cup.
+    * The line is on the back wall, where the camera sees it from the start; SoftGym's is on the left.
+
+    ## Version History
+
+    * v0: initial version
+    """
+
     state_names: ClassVar[tuple[str, ...]] = (*PourWaterEnv.state_names, "line height", "target fraction")
     best_performance: ClassVar[float] = 0.0
 

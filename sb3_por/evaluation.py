@@ -253,7 +253,7 @@ def _observation_kwargs(env_id: str, space: spaces.Space) -> dict[str, Any]:
     if env_id not in ENV_IDS:
         return {}
     image = space.spaces.get("image") if isinstance(space, spaces.Dict) else space
-    if image is None or not is_image_space(image, check_channels=False):
+    if image is None or not is_image_space(image, check_channels=False) or image.shape is None:
         return {"obs_type": "state"}
     # Channels first or last, the middle axis of a square image is its size.
     return {"obs_type": "dict" if isinstance(space, spaces.Dict) else "pixels", "image_size": image.shape[1]}

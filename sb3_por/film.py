@@ -60,7 +60,7 @@ def film(
     return evaluation
 
 
-def write_film(path: str | Path, frames: list[np.ndarray], fps: float) -> None:
+def write_film(path: str | Path, frames: list[Any], fps: float) -> None:
     """
     :param path: ``.gif`` or ``.mp4``
     :param frames: uint8 images, ``(height, width, 3)``, at least one

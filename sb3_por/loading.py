@@ -38,7 +38,7 @@ def load_model(path: str | Path, algo: str | None = None, device: str = "auto") 
         candidates = [algo]
     else:
         candidates = _candidates(path, data)
-    buffer = {"buffer_size": 1} if "buffer_size" in data else {}
+    buffer: dict[str, Any] = {"buffer_size": 1} if "buffer_size" in data else {}
     problem: Exception | None = None
     for name in candidates:
         try:
@@ -100,7 +100,8 @@ def _candidates(path: Path, data: dict[str, Any]) -> list[str]:
     module = data["policy_class"].get("__module__") if isinstance(data["policy_class"], dict) else None
 
     def unlikeliness(name: str) -> tuple[bool, int, int]:
-        arguments = {argument for cls in LOADABLE[name].__mro__ for argument in inspect.signature(cls.__init__).parameters}
+        constructors = [vars(cls)["__init__"] for cls in LOADABLE[name].__mro__ if "__init__" in vars(cls)]
+        arguments = {argument for init in constructors for argument in inspect.signature(init).parameters}
         return name not in recorded, len(arguments - set(data)), -len(arguments)
 
     names = [

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -125,7 +126,7 @@ def draw_curves(curves: dict[str, Curve], metric: str = "normalized_performance"
         for i, (algo, curve) in enumerate(curves.items()):
             seeds = f"{curve.n_seeds} seed{'s' if curve.n_seeds > 1 else ''}"
             label = f"{algo} ({seeds}, {len(curve.envs)} tasks)" if len(curve.envs) > 1 else f"{algo} ({seeds})"
-            look = dict(color=COLORS[i % len(COLORS)], linestyle=STYLES[i % len(STYLES)])
+            look: dict[str, Any] = dict(color=COLORS[i % len(COLORS)], linestyle=STYLES[i % len(STYLES)])
             marker = "o" if len(curve.steps) < 30 else None
             axes.plot(curve.steps, curve.iqm, label=label, linewidth=2, marker=marker, markersize=4, **look)
             axes.fill_between(curve.steps, curve.low, curve.high, color=look["color"], alpha=0.2, linewidth=0)

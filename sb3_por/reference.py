@@ -62,7 +62,8 @@ REFERENCES = {"random": RandomModel, "expert": ExpertModel}
 
 def _spaces(env_id: str) -> tuple[gym.Space, gym.Space]:
     try:
-        env = gym.make(env_id, **({"obs_type": "state"} if env_id in ENV_IDS else {}))
+        kwargs: dict[str, Any] = {"obs_type": "state"} if env_id in ENV_IDS else {}
+        env = gym.make(env_id, **kwargs)
     except gym.error.Error as error:
         raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
     env.close()

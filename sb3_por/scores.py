@@ -22,9 +22,9 @@ def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
     :return: one row an evaluation with the columns ``COLUMNS``, sorted; a metric that was not recorded is NaN
     :raises UserError: if a path holds no scores, or two runs of one algorithm and environment have one seed
     """
-    paths = [Path(path) for path in paths]
-    tables = [read_csv(path) for path in paths if path.suffix == ".csv"]
-    folders = [path for path in paths if path.suffix != ".csv"]
+    given = [Path(path) for path in paths]
+    tables = [read_csv(path) for path in given if path.suffix == ".csv"]
+    folders = [path for path in given if path.suffix != ".csv"]
     tables += [read_run(run) for run in find_runs(folders)]
     scores = pd.concat(tables, ignore_index=True).sort_values([*RUN_KEYS, "step"], kind="stable", ignore_index=True)
     doubled = scores[scores.duplicated([*RUN_KEYS, "step"])]

@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments is not None:
         sys.argv = ["train.py", *arguments]
     # The zoo's train() has no hooks: it finds these three by name in its module.
-    rl_zoo3.train.argparse = types.SimpleNamespace(ArgumentParser=Parser)  # type: ignore[attr-defined]
+    rl_zoo3.train.argparse = types.SimpleNamespace(ArgumentParser=Parser)  # type: ignore[assignment]
     rl_zoo3.train.StoreDict = Settings  # type: ignore[misc]
     rl_zoo3.train.ExperimentManager = Experiment  # type: ignore[misc]
     return exit_code(rl_zoo3.train.train, "train.py")

@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import polyak_update
 
 from sb3_por.augmentations import RandomShift
+from sb3_por.memory import keep_freed_memory
 from sb3_por.objectives.base import Objective
 from sb3_por.replay import SequenceReplayBuffer
 from sb3_por.rng import get_rng_state, set_rng_state
@@ -100,6 +101,8 @@ class VisualActorCritic(ABC):
                 warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
         self._check_buffer()
+        if self.device.type == "cpu":
+            keep_freed_memory()
         self._metrics = defaultdict(list)
         self._augment = RandomShift(self.augmentation_pad)
         self._image_keys = self._find_image_keys()

@@ -1,4 +1,4 @@
-"""The two ends of the scale as models: a policy that acts at random and the scripted expert of a task."""
+"""The ends of the scale as models: policies that do nothing or act at random, and the scripted expert of a task."""
 
 from typing import Any
 
@@ -26,6 +26,23 @@ class RandomModel:
     ) -> tuple[np.ndarray, Any]:
         """One action for each of the observations."""
         return np.stack([self.action_space.sample() for _ in observation]), state
+
+
+class IdleModel:
+    """
+    Does nothing: the middle of every action's range.
+
+    :param env_id: a Gymnasium id with a ``Box`` action space
+    """
+
+    def __init__(self, env_id: str) -> None:
+        self.observation_space, self.action_space = _spaces(env_id)
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """The same action for each of the observations."""
+        return np.stack([(self.action_space.low + self.action_space.high) / 2 for _ in observation]), state
 
 
 class ExpertModel:
@@ -57,7 +74,7 @@ class ExpertModel:
 
 
 #: What ``--model`` takes besides files.
-REFERENCES = {"random": RandomModel, "expert": ExpertModel}
+REFERENCES = {"random": RandomModel, "nothing": IdleModel, "expert": ExpertModel}
 
 
 def _spaces(env_id: str) -> tuple[gym.Space, gym.Space]:

@@ -1,0 +1,90 @@
+"""Take two corners and carry them over the cloth to the corners opposite."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Generator
+
+import numpy as np
+
+from softbody_envs.sim.pickers import REACH
+
+#: Height of a picker's centre above the corner it takes, m, and while it travels to it.
+GRASP_HEIGHT = 0.045
+TRAVEL_HEIGHT = 0.10
+#: Control steps that the carried edge is in the air, and its highest point, in half lengths of the cloth.
+CARRY_STEPS = 28
+ARCH = 0.95
+#: Two positions nearer than this are the same, m.
+NEAR = 0.01
+
+#: Yields an action and is sent the next state.
+Script = Generator[np.ndarray, np.ndarray, None]
+
+
+class ScriptedExpert(ABC):
+    """Plays a script."""
+
+    def __init__(self) -> None:
+        self._script: Script | None = None
+
+    def reset(self) -> None:
+        """Start again with the next state."""
+        self._script = None
+
+    def act(self, state: np.ndarray) -> np.ndarray:
+        """The next action of the script."""
+        state = np.asarray(state, dtype=np.float64)
+        if self._script is not None:
+            return self._script.send(state)
+        self._script = self.script(state)
+        return next(self._script)
+
+    @abstractmethod
+    def script(self, state: np.ndarray) -> Script:
+        """A script that begins in a state and never ends."""
+
+
+def corners(state: np.ndarray) -> np.ndarray:
+    """Of the cloth: the two of the edge to carry, then the two they belong on, m, ``(4, 3)``."""
+    return state[:12].reshape(4, 3)
+
+
+def pickers(state: np.ndarray) -> np.ndarray:
+    """Centres of the pickers, m, ``(2, 3)``."""
+    return state[12:18].reshape(2, 3)
+
+
+def go(goals: np.ndarray, state: np.ndarray, pick: bool) -> np.ndarray:
+    """The action that takes the pickers to their goals, m, ``(2, 3)``, or as near as one step can."""
+    move = np.clip((goals - pickers(state)) / REACH, -1.0, 1.0)
+    return np.column_stack([move, np.full(2, 1.0 if pick else -1.0)]).ravel()
+
+
+def leave(state: np.ndarray) -> Script:
+    """Let go, then rise and stay there."""
+    goals = pickers(state)
+    state = yield go(goals, state, pick=False)
+    goals = goals + (0.0, 0.0, TRAVEL_HEIGHT)
+    while True:
+        state = yield go(goals, state, pick=False)
+
+
+class FoldClothExpert(ScriptedExpert):
+    """Folds the cloth along its middle."""
+
+    def script(self, state: np.ndarray) -> Script:
+        """Travel to the corners, descend, take them, carry them on an arch, let go."""
+        for height in (TRAVEL_HEIGHT, GRASP_HEIGHT):
+            while True:
+                goals = corners(state)[:2] + (0.0, 0.0, height)
+                if np.abs(goals - pickers(state)).max() < NEAR:
+                    break
+                state = yield go(goals, state, pick=False)
+        while not state[18:].all():
+            state = yield go(pickers(state), state, pick=True)
+
+        start, way = pickers(state), corners(state)[2:] - corners(state)[:2]
+        radius = np.linalg.norm(way, axis=1, keepdims=True) / 2
+        for angle in np.pi * np.linspace(0, 1, CARRY_STEPS + 1)[1:]:
+            rise = ARCH * radius * np.sin(angle) * (0.0, 0.0, 1.0)
+            state = yield go(start + way * (1 - np.cos(angle)) / 2 + rise, state, pick=True)
+        yield from leave(state)

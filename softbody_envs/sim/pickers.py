@@ -1,0 +1,167 @@
+"""Pickers: spheres that move freely, take hold of the nearest node of a rope or a cloth, and let it go."""
+
+from typing import Protocol
+
+import numpy as np
+import pybullet
+
+from softbody_envs.sim.world import GRAVITY, World
+
+#: Farthest that a picker moves along each axis in one control step, m, and the sub-steps it takes (SoftGym: 8 of 0.01 m).
+REACH = 0.08
+SUBSTEPS = 8
+#: A picker's body, kg. What it holds can slow it down: in a sub-step it is pushed by at most ``MASS * (LAG + move)``.
+MASS = 0.015
+#: How far a picker may fall behind where it was sent, m; it does not catch up on more.
+LAG = 0.008
+#: One colour a picker, and the shade it takes while it holds something.
+COLORS = ((0.85, 0.20, 0.15, 1.0), (0.15, 0.60, 0.20, 1.0))
+HOLDING_COLORS = ((0.40, 0.05, 0.03, 1.0), (0.02, 0.25, 0.05, 1.0))
+
+
+class Graspable(Protocol):
+    """What pickers can hold."""
+
+    def nodes(self) -> np.ndarray:
+        """Positions of the nodes now, m, ``(n, 3)``."""
+
+    def hold(self, node: int, body: int) -> int:
+        """Tie a node to a body, at the offset they have now; return a handle for ``release``."""
+
+    def release(self, handle: int) -> None:
+        """Untie what ``hold`` tied."""
+
+    def tether(self, first: int, second: int) -> float:
+        """How far apart two held nodes may be pulled, m."""
+
+
+class Pickers:
+    """
+    Two pickers, SoftGym's way: an action is ``(dx, dy, dz, pick)`` for each, ``pick > 0`` grasps and holds.
+
+    A picker takes the nearest free node within its range and keeps the offset it had. Pickers push nothing. They are
+    not infinitely strong: one that holds what cannot follow stays behind, and two that hold the same thing cannot
+    be sent farther apart than its ``tether``.
+
+    :param world: what the pickers' bodies are made in
+    :param target: what they can hold
+    :param positions: of their centres at first, m, ``(2, 3)``
+    :param low: corner of the box their centres stay in, m
+    :param high: opposite corner, m
+    :param radius: of the spheres, m
+    :param grasp_range: farthest node that can be taken, m from the centre
+    :param mass: of a picker, kg: a heavy one goes where it is sent whatever it holds
+    """
+
+    def __init__(
+        self,
+        world: World,
+        target: Graspable,
+        positions: np.ndarray,
+        low: np.ndarray,
+        high: np.ndarray,
+        radius: float,
+        grasp_range: float,
+        mass: float = MASS,
+    ) -> None:
+        self._world = world
+        self._target = target
+        #: Centres now, m, ``(2, 3)``, and where they were last sent.
+        self.positions = np.array(positions, dtype=np.float64)
+        self._sent = self.positions.copy()
+        self._low, self._high = np.asarray(low), np.asarray(high)
+        self._grasp_range = grasp_range
+        self._interval = max(1, world.steps_per_control // SUBSTEPS)
+        # Falling and being lifted again, a picker ends each sub-step at the height it was sent to.
+        self._lift = np.array([0.0, 0.0, -GRAVITY * world.time_step * (self._interval + 1) / 2])
+        self._bodies = [self._create(mass, position, color, radius) for position, color in zip(positions, COLORS, strict=True)]
+        #: The node that each picker holds, or ``None``.
+        self.held: list[int | None] = [None] * len(self._bodies)
+        self._handles: list[int] = [-1] * len(self._bodies)
+        self._offsets = np.zeros_like(self.positions)
+
+    def _create(self, mass: float, position: np.ndarray, color: tuple[float, ...], radius: float) -> int:
+        client = self._world.client
+        look = client.createVisualShape(pybullet.GEOM_SPHERE, radius=radius, rgbaColor=color)
+        body = client.createMultiBody(mass, -1, look, position, useMaximalCoordinates=True)
+        client.changeDynamics(body, -1, linearDamping=0.0)
+        return body
+
+    def control(self, action: np.ndarray) -> None:
+        """
+        Advance the world by one control step while the pickers carry out an action.
+
+        :param action: ``(dx, dy, dz, pick)`` of each picker in turn, in [-1, 1]
+        """
+        commands = action.reshape(len(self._bodies), 4)
+        picks = commands[:, 3] > 0.0
+        substeps = self._world.steps_per_control // self._interval
+        move = commands[:, :3] * (REACH / substeps)
+        for picker, pick in enumerate(picks):
+            if not pick:
+                self._release(picker)
+        for _ in range(substeps):
+            self._grasp(picks)
+            self._send(move)
+            for _ in range(self._interval):
+                self._world.step()
+            self._locate()
+
+    def _release(self, picker: int) -> None:
+        """Let go of what a picker holds, if anything."""
+        if self.held[picker] is not None:
+            self._target.release(self._handles[picker])
+            self.held[picker] = None
+            self._paint(picker, COLORS)
+
+    def _grasp(self, picks: np.ndarray) -> None:
+        """Let each picker that wants to and is empty take the nearest free node in range."""
+        empty = [picker for picker, pick in enumerate(picks) if pick and self.held[picker] is None]
+        if not empty:
+            return
+        nodes = self._target.nodes()
+        for picker in empty:
+            offsets = nodes - self.positions[picker]
+            distances = np.sqrt((offsets**2).sum(axis=1))
+            distances[[node for node in self.held if node is not None]] = np.inf
+            node = int(distances.argmin())
+            if distances[node] <= self._grasp_range:
+                self.held[picker] = node
+                self._handles[picker] = self._target.hold(node, self._bodies[picker])
+                self._offsets[picker] = offsets[node]
+                self._paint(picker, HOLDING_COLORS)
+
+    def _send(self, move: np.ndarray) -> None:
+        """Give the pickers the velocities that bring them, if nothing holds them back, to the end of a sub-step's move."""
+        there = np.clip(self._sent + move, self._low, self._high)
+        if None not in self.held:
+            there = self._restrained(there, self._target.tether(*self.held))
+        way = there - self.positions
+        distance = np.sqrt((way**2).sum(axis=1, keepdims=True))
+        longest = LAG + np.sqrt((move**2).sum(axis=1, keepdims=True))
+        way *= longest / np.maximum(distance, longest)
+        self._sent = self.positions + way
+        for body, velocity in zip(self._bodies, way / (self._world.time_step * self._interval) + self._lift, strict=True):
+            self._world.client.resetBaseVelocity(body, velocity, (0.0, 0.0, 0.0))
+
+    def _restrained(self, there: np.ndarray, tether: float) -> np.ndarray:
+        """Where the pickers go instead, each giving way by half, so that the held nodes stay within their tether."""
+        first, second = there + self._offsets
+        distance = np.sqrt(((second - first) ** 2).sum())
+        if distance <= tether:
+            return there
+        give = (second - first) * (1 - tether / distance) / 2
+        return np.clip(there + np.stack([give, -give]), self._low, self._high)
+
+    def remove(self) -> None:
+        """Let go and take the pickers out of the world."""
+        for picker, body in enumerate(self._bodies):
+            self._release(picker)
+            self._world.client.removeBody(body)
+
+    def _locate(self) -> None:
+        get = self._world.client.getBasePositionAndOrientation
+        self.positions = np.array([get(body)[0] for body in self._bodies])
+
+    def _paint(self, picker: int, colors: tuple[tuple[float, ...], ...]) -> None:
+        self._world.client.changeVisualShape(self._bodies[picker], -1, rgbaColor=colors[picker])

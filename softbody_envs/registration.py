@@ -8,6 +8,8 @@ _TABLE = {
     "PourWaterAmount-v0": ("pour_water_amount:PourWaterAmountEnv", 100),
     "FoldCloth-v0": ("fold_cloth:FoldClothEnv", 100),
     "DropFoldCloth-v0": ("drop_fold_cloth:DropFoldClothEnv", 100),
+    "FallingBall-v0": ("falling_ball:FallingBallEnv", 50),
+    "SwingingBall-v0": ("swinging_ball:SwingingBallEnv", 100),
 }
 
 #: Every id that ``import softbody_envs`` registers.

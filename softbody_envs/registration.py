@@ -6,6 +6,7 @@ import gymnasium as gym
 _TABLE = {
     "PourWater-v0": ("pour_water:PourWaterEnv", 100),
     "PourWaterAmount-v0": ("pour_water_amount:PourWaterAmountEnv", 100),
+    "StraightenRope-v0": ("straighten_rope:StraightenRopeEnv", 75),
     "FoldCloth-v0": ("fold_cloth:FoldClothEnv", 100),
     "DropFoldCloth-v0": ("drop_fold_cloth:DropFoldClothEnv", 100),
     "FallingBall-v0": ("falling_ball:FallingBallEnv", 50),

@@ -23,6 +23,7 @@ class Expert(Protocol):
 _TABLE = {
     "PourWater-v0": "pour_water:PourWaterExpert",
     "PourWaterAmount-v0": "pour_water:PourWaterAmountExpert",
+    "StraightenRope-v0": "straighten_rope:StraightenRopeExpert",
     "FoldCloth-v0": "fold_cloth:FoldClothExpert",
     "DropFoldCloth-v0": "drop_fold_cloth:DropFoldClothExpert",
 }

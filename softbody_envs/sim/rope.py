@@ -1,0 +1,126 @@
+"""A rope: rigid segments in a chain, in a plain rigid world."""
+
+from itertools import pairwise
+
+import numpy as np
+import pybullet
+
+from softbody_envs.sim.world import World
+
+#: Length of the straight rope, m, and the number of its segments.
+LENGTH = 0.5
+N_SEGMENTS = 20
+N_NODES = N_SEGMENTS + 1
+SPACING = LENGTH / N_SEGMENTS
+RADIUS = 0.009
+#: Mass of a segment, kg.
+SEGMENT_MASS = 0.005
+#: Simulation steps in a control step: fewer, and fast pulls stretch the rope.
+STEPS_PER_CONTROL = 48
+#: SoftGym's rope colour.
+COLOR = (0.0, 0.5, 1.0, 1.0)
+#: A rope stretched or shrunk by more than this fraction, or further away, m, has exploded.
+MAX_STRETCH = 0.2
+MAX_DISTANCE = 2.0
+
+_HALF = np.array([0.0, 0.0, SPACING / 2])
+
+
+class Rope:
+    """
+    Each segment is a sphere that collides, drawn as a capsule as long as the segment; point-to-point constraints join
+    the ends. Nodes are the joints and the two free ends. Spheres closer than their diameter do not pass through each
+    other, and neighbours touch when the rope bends by 88 degrees at a joint.
+
+    :param world: a rigid world
+    :param nodes: m, ``(N_NODES, 3)``, neighbours ``SPACING`` apart
+    """
+
+    def __init__(self, world: World, nodes: np.ndarray) -> None:
+        self._world = world
+        client = world.client
+        # Much damping, for a segment that spins fast leaves its joints in one step; stiff joints pull it back at once.
+        client.setPhysicsEngineParameter(numSolverIterations=15, erp=1.0)
+        shape = client.createCollisionShape(pybullet.GEOM_SPHERE, radius=RADIUS)
+        look = client.createVisualShape(pybullet.GEOM_CAPSULE, radius=RADIUS, length=SPACING, rgbaColor=COLOR)
+        self._segments = [
+            client.createMultiBody(
+                SEGMENT_MASS,
+                shape,
+                look,
+                basePosition=(start + end) / 2,
+                baseOrientation=_orientation(end - start),
+                useMaximalCoordinates=True,
+            )
+            for start, end in pairwise(nodes)
+        ]
+        for segment in self._segments:
+            client.changeDynamics(segment, -1, lateralFriction=1.0, restitution=0.0, linearDamping=0.99, angularDamping=0.99)
+        for first, second in pairwise(self._segments):
+            client.createConstraint(first, -1, second, -1, pybullet.JOINT_POINT2POINT, (0, 0, 0), _HALF, -_HALF)
+
+    def nodes(self) -> np.ndarray:
+        """Positions of the nodes now, m, ``(N_NODES, 3)``; a joint is the middle between the two ends that meet there."""
+        get = self._world.client.getBasePositionAndOrientation
+        poses = [get(segment) for segment in self._segments]
+        centres = np.array([position for position, _ in poses])
+        x, y, z, w = np.array([orientation for _, orientation in poses]).T
+        axes = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+        starts, ends = centres - axes * SPACING / 2, centres + axes * SPACING / 2
+        return np.concatenate([starts[:1], (ends[:-1] + starts[1:]) / 2, ends[-1:]])
+
+    def hold(self, node: int, body: int) -> int:
+        """Tie a node to a body, at the offset they have now; return a handle for ``release``."""
+        client = self._world.client
+        segment, pivot = (node, -_HALF) if node < N_SEGMENTS else (N_SEGMENTS - 1, _HALF)
+        position, orientation = client.getBasePositionAndOrientation(segment := self._segments[segment])
+        point, _ = client.multiplyTransforms(position, orientation, pivot, (0, 0, 0, 1))
+        centre, _ = client.getBasePositionAndOrientation(body)
+        return client.createConstraint(
+            segment, -1, body, -1, pybullet.JOINT_POINT2POINT, (0, 0, 0), pivot, np.subtract(point, centre)
+        )
+
+    def release(self, handle: int) -> None:
+        """Untie what ``hold`` tied."""
+        self._world.client.removeConstraint(handle)
+
+    def tether(self, first: int, second: int) -> float:
+        """How far apart two held nodes may be pulled, m: the rope between them."""
+        return abs(first - second) * SPACING
+
+
+def length(nodes: np.ndarray) -> float:
+    """
+    :param nodes: m, ``(n, 3)``
+    :return: length of the line through them, m
+    """
+    return float(np.linalg.norm(np.diff(nodes, axis=0), axis=1).sum())
+
+
+def end_distance(nodes: np.ndarray) -> float:
+    """
+    :param nodes: m, ``(n, 3)``
+    :return: distance between the first and the last, m
+    """
+    return float(np.linalg.norm(nodes[-1] - nodes[0]))
+
+
+def failure(nodes: np.ndarray) -> str | None:
+    """
+    :param nodes: m, ``(n, 3)``
+    :return: what shows that the simulation has failed, or ``None``
+    """
+    if not np.isfinite(nodes).all() or np.abs(nodes).max() > MAX_DISTANCE:
+        return "the rope has left the scene"
+    if abs(length(nodes) / LENGTH - 1) > MAX_STRETCH:
+        return f"the rope is {length(nodes):.2f} m long instead of {LENGTH} m"
+    return None
+
+
+def _orientation(axis: np.ndarray) -> np.ndarray:
+    """The shortest rotation that turns z to an axis, as a quaternion (x, y, z, w)."""
+    x, y, z = axis / np.linalg.norm(axis)
+    if z < -1 + 1e-9:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    quaternion = np.array([-y, x, 0.0, 1.0 + z])
+    return quaternion / np.linalg.norm(quaternion)

@@ -1,0 +1,114 @@
+"""
+The crumpled ropes that episodes start from.
+
+``python -m softbody_envs.sim.rope_bank`` makes them anew (four minutes) and overwrites the file that the package ships.
+"""
+
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+from tqdm import trange
+
+from softbody_envs.sim.pickers import REACH, Pickers
+from softbody_envs.sim.rope import LENGTH, N_NODES, RADIUS, STEPS_PER_CONTROL, Rope, end_distance
+from softbody_envs.sim.world import World
+from softbody_envs.variations import N_VARIATIONS, variation_rng
+
+PATH = files("softbody_envs.sim") / "rope_bank.npz"
+#: Variations that start from the same crumpled rope, turned and mirrored; none of them is in the other split.
+VARIATIONS_PER_STATE = 4
+#: Positions are kept as whole multiples of this, m.
+RESOLUTION = 1e-5
+#: SoftGym's recipe: so often, some node is pulled for 0.6 s at 0.5 m/s along each axis at most, then dropped.
+PULLS = 4
+PULL_STEPS = 8
+PULL_SPEED = 0.04
+DROP_STEPS = 12
+#: At rest, no node moves farther than this in one control step, m; a rope that takes longer is drawn again.
+REST = 2e-4
+MAX_SETTLE_STEPS = 100
+#: A start has its ends at most so far apart, m, or there would be little to straighten,
+MAX_END_DISTANCE = 0.35
+#: and, before it is turned, no node farther from the middle: however it is turned, the pickers reach all of it.
+MAX_EXTENT = 0.25
+
+
+@cache
+def _bank() -> np.ndarray:
+    with PATH.open("rb") as file:
+        return np.load(file)["nodes"]
+
+
+def crumpled(variation: int, rng: np.random.Generator) -> np.ndarray:
+    """
+    :param variation: 0..999
+    :param rng: draws the turn about the z axis and whether to mirror
+    :return: nodes of a rope at rest on the floor, its bounding box centred on the z axis, m, ``(N_NODES, 3)``
+    """
+    nodes = _bank()[variation // VARIATIONS_PER_STATE] * RESOLUTION
+    cos, sin = np.cos(yaw := rng.uniform(-np.pi, np.pi)), np.sin(yaw)
+    mirror = rng.choice([-1.0, 1.0])
+    return _centred(nodes @ np.array([[cos, sin, 0.0], [-mirror * sin, mirror * cos, 0.0], [0.0, 0.0, 1.0]]))
+
+
+def _centred(nodes: np.ndarray) -> np.ndarray:
+    """The same rope with its bounding box centred on the z axis."""
+    middle = (nodes.min(axis=0) + nodes.max(axis=0)) / 2
+    return nodes - middle * (1.0, 1.0, 0.0)
+
+
+def crumple(world: World, rng: np.random.Generator) -> np.ndarray | None:
+    """
+    Empty a world, lay a straight rope in it and pull it about.
+
+    :return: nodes of a rope at rest, centred, m, ``(N_NODES, 3)``, or ``None`` if what came out is no good start
+    """
+    world.clear()
+    world.add_floor()
+    along = np.linspace(-LENGTH / 2, LENGTH / 2, N_NODES)[:, None]
+    rope = Rope(world, along * (1.0, 0.0, 0.0) + (0.0, 0.0, RADIUS))
+    bounds = np.full(3, 2.0)
+    for _ in range(PULLS):
+        start = rope.nodes()[rng.integers(N_NODES)]
+        pull = rng.uniform(-1.0, 1.0, 3) + (0.0, 0.0, 1.0)
+        pickers = Pickers(world, rope, np.stack([start, bounds]), -bounds, bounds, radius=0.01, grasp_range=0.01)
+        for _ in range(PULL_STEPS):
+            pickers.control(np.array([*pull * PULL_SPEED / REACH, 1.0, 0.0, 0.0, 0.0, -1.0]))
+        for _ in range(DROP_STEPS):
+            pickers.control(np.array([0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0]))
+        pickers.remove()
+    nodes = _settle(world, rope)
+    if nodes is None or end_distance(nodes) > MAX_END_DISTANCE:
+        return None
+    nodes = _centred(nodes)
+    return nodes if np.linalg.norm(nodes[:, :2], axis=1).max() <= MAX_EXTENT else None
+
+
+def _settle(world: World, rope: Rope) -> np.ndarray | None:
+    """Wait until the rope is at rest; return its nodes, or ``None`` if that takes too long."""
+    before = rope.nodes()
+    for _ in range(MAX_SETTLE_STEPS):
+        for _ in range(world.steps_per_control):
+            world.step()
+        nodes = rope.nodes()
+        if np.abs(nodes - before).max() <= REST:
+            return nodes
+        before = nodes
+    return None
+
+
+def main() -> None:
+    """Make the bank."""
+    bank = np.empty((N_VARIATIONS // VARIATIONS_PER_STATE, N_NODES, 3), dtype=np.int16)
+    world = World(STEPS_PER_CONTROL)
+    for state in trange(len(bank)):
+        rng = variation_rng("rope bank", state)
+        while (nodes := crumple(world, rng)) is None:
+            pass
+        bank[state] = np.rint(nodes / RESOLUTION)
+    np.savez_compressed(str(PATH), nodes=bank)
+
+
+if __name__ == "__main__":
+    main()

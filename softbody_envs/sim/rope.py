@@ -17,8 +17,9 @@ RADIUS = 0.009
 SEGMENT_MASS = 0.005
 #: Simulation steps in a control step: fewer, and fast pulls stretch the rope.
 STEPS_PER_CONTROL = 48
-#: SoftGym's rope colour.
+#: SoftGym's rope colour, and that of the first and the last segment: in a heap an end looks like a bend.
 COLOR = (0.0, 0.5, 1.0, 1.0)
+END_COLOR = (1.0, 0.8, 0.0, 1.0)
 #: A rope stretched or shrunk by more than this fraction, or further away, m, has exploded.
 MAX_STRETCH = 0.2
 MAX_DISTANCE = 2.0
@@ -42,17 +43,20 @@ class Rope:
         # Much damping, for a segment that spins fast leaves its joints in one step; stiff joints pull it back at once.
         client.setPhysicsEngineParameter(numSolverIterations=15, erp=1.0)
         shape = client.createCollisionShape(pybullet.GEOM_SPHERE, radius=RADIUS)
-        look = client.createVisualShape(pybullet.GEOM_CAPSULE, radius=RADIUS, length=SPACING, rgbaColor=COLOR)
+        look, end_look = (
+            client.createVisualShape(pybullet.GEOM_CAPSULE, radius=RADIUS, length=SPACING, rgbaColor=color)
+            for color in (COLOR, END_COLOR)
+        )
         self._segments = [
             client.createMultiBody(
                 SEGMENT_MASS,
                 shape,
-                look,
+                end_look if i in (0, N_SEGMENTS - 1) else look,
                 basePosition=(start + end) / 2,
                 baseOrientation=_orientation(end - start),
                 useMaximalCoordinates=True,
             )
-            for start, end in pairwise(nodes)
+            for i, (start, end) in enumerate(pairwise(nodes))
         ]
         for segment in self._segments:
             client.changeDynamics(segment, -1, lateralFriction=1.0, restitution=0.0, linearDamping=0.99, angularDamping=0.99)

@@ -28,10 +28,12 @@ DROP_STEPS = 12
 #: At rest, no node moves farther than this in one control step, m; a rope that takes longer is drawn again.
 REST = 2e-4
 MAX_SETTLE_STEPS = 100
-#: A start has its ends at most so far apart, m, or there would be little to straighten,
+#: The ends of a start are at most so far apart, m, or there would be little to straighten.
 MAX_END_DISTANCE = 0.35
-#: and, before it is turned, no node farther from the middle: however it is turned, the pickers reach all of it.
+#: No node of it is farther from the middle, m: however it is turned, the pickers reach all of it.
 MAX_EXTENT = 0.25
+#: Nothing lies on its ends: so far around them, m, no other part of the rope is higher.
+CLEARANCE = 1.5 * RADIUS
 
 
 @cache
@@ -79,10 +81,12 @@ def crumple(world: World, rng: np.random.Generator) -> np.ndarray | None:
             pickers.control(np.array([0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0]))
         pickers.remove()
     nodes = _settle(world, rope)
-    if nodes is None or end_distance(nodes) > MAX_END_DISTANCE:
+    if nodes is None:
         return None
     nodes = _centred(nodes)
-    return nodes if np.linalg.norm(nodes[:, :2], axis=1).max() <= MAX_EXTENT else None
+    extent = np.linalg.norm(nodes[:, :2], axis=1).max()
+    good = end_distance(nodes) <= MAX_END_DISTANCE and extent <= MAX_EXTENT and _shows_its_ends(nodes)
+    return nodes if good else None
 
 
 def _settle(world: World, rope: Rope) -> np.ndarray | None:
@@ -96,6 +100,17 @@ def _settle(world: World, rope: Rope) -> np.ndarray | None:
             return nodes
         before = nodes
     return None
+
+
+def _shows_its_ends(nodes: np.ndarray) -> bool:
+    """Whether both ends are seen from above."""
+    for line in (nodes, nodes[::-1]):
+        end = line[0]
+        others = np.concatenate([line[2:], (line[2:] + line[1:-1]) / 2])
+        near = np.linalg.norm((others - end)[:, :2], axis=1) < CLEARANCE
+        if (others[near, 2] > end[2]).any():
+            return False
+    return True
 
 
 def main() -> None:

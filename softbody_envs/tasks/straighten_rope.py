@@ -29,8 +29,8 @@ class StraightenRopeEnv(SoftbodyEnv):
     A crumpled rope lies on the floor, seen from straight above. Two pickers hover over it. Straighten it: bring its ends as
     far apart as the rope is long.
 
-    The rope is 0.5 m long: 20 rigid segments in a chain, in Bullet's rigid world. A picker is a sphere, red or green, dark
-    while it holds something. Nothing outside the image can be reached.
+    The rope is 0.5 m long: 20 rigid segments in a chain, in Bullet's rigid world. It is blue with yellow ends. A picker is a
+    sphere, red or green, dark while it holds something.
 
     ## Action Space
 
@@ -69,8 +69,8 @@ class StraightenRopeEnv(SoftbodyEnv):
 
     One of 250 ropes at rest, each made as in SoftGym: four times, some node of a straight rope is pulled for 0.6 s in a random
     direction and dropped. A variation turns the rope by a random angle, may mirror it, and centres it. The ends are at most
-    0.35 m apart. The pickers are 10 cm above the floor, 4 cm to either side of the middle. Training and held-out variations
-    share no rope.
+    0.35 m apart and nothing lies on them. The pickers are 10 cm above the floor, 4 cm to either side of the middle. Training
+    and held-out variations share no rope.
 
     ## Episode End
 
@@ -87,7 +87,9 @@ class StraightenRopeEnv(SoftbodyEnv):
       untouched rope scores well above 0 there.
     * The rope keeps its length within 5 %, whatever the pickers do. SoftGym's has 7.5 % of slack and can be stretched.
     * 21 nodes instead of 41 particles; the state has the same ten of them, and says which picker holds something.
-    * Ends farther apart than 0.35 m at the start are drawn again: little would be left to do.
+    * A start with its ends farther apart than 0.35 m, or under the rest of the rope, is drawn again: little would be left
+      to do, or the image would not show what to do.
+    * The ends are marked: in a heap of rope they look like bends.
     * Pickers do not push the rope. Their box is smaller (0.33 m and 0.28 m in SoftGym) and the camera higher (0.85 m
       there): the pickers never leave the image.
 

@@ -11,9 +11,11 @@ from softbody_envs.rendering import Camera
 LIGHT = np.array([-0.5, -1.5, 2.5]) / np.linalg.norm([-0.5, -1.5, 2.5])
 AMBIENT = 0.5
 #: Points a pixel along each direction of the sheet: no pixel inside it stays empty.
-DENSITY = 1.6
-#: The sheet lies this far in front of what touches it, and its underside, which a fold turns up, in front of its face, m.
+DENSITY = 1.45
+#: The sheet is this far in front of what it lies on, and its underside, which a fold turns up, in front of its face: m,
+#: and in lengths that a pixel covers, for that is how well a pixel tells distances on a slope.
 CLEARANCE = 0.004
+PIXELS_CLEARANCE = 1.5
 
 
 def paint_sheet(
@@ -41,7 +43,7 @@ def paint_sheet(
     x, y, distance = _project(points, camera, size)
     toward_eye = np.asarray(camera.position) - points
     is_face = (normals * toward_eye).sum(axis=1) > 0
-    distance = distance - CLEARANCE * np.where(is_face, 1, 2)
+    distance = distance - (CLEARANCE + PIXELS_CLEARANCE * distance / _focal(camera, size)) * np.where(is_face, 1, 2)
 
     column, row = np.floor(x).astype(int), np.floor(y).astype(int)
     shown = (distance > camera.near) & (column >= 0) & (column < size) & (row >= 0) & (row < size)
@@ -61,7 +63,7 @@ def _surface(grid: np.ndarray, camera: Camera, size: int) -> tuple[np.ndarray, n
     x, y, _ = _project(grid, camera, size)
     flat = np.stack([x, y], axis=-1)
     longest = max(np.linalg.norm(np.diff(flat, axis=axis), axis=-1).max() for axis in (0, 1))
-    per_cell = int(np.clip(np.ceil(DENSITY * longest), 1, size))
+    per_cell = int(np.clip(np.ceil(DENSITY * longest), 1, size // 4))  # a cell beside the eye is not worth more
     (rows, along_rows), (columns, along_columns) = (_spline(n, per_cell) for n in grid.shape[:2])
     across = np.tensordot(columns, grid, (1, 1)).swapaxes(0, 1)
     points = np.tensordot(rows, across, 1)
@@ -83,8 +85,13 @@ def _project(points: np.ndarray, camera: Camera, size: int) -> tuple[np.ndarray,
     view = np.reshape(camera.view, (4, 4), order="F")
     x, y, z = np.moveaxis(points @ view[:3, :3].T + view[:3, 3], -1, 0)
     distance = np.maximum(-z, 1e-6)
-    focal = size / 2 / np.tan(np.radians(camera.fov) / 2)
+    focal = _focal(camera, size)
     return size / 2 + focal * x / distance, size / 2 - focal * y / distance, -z
+
+
+def _focal(camera: Camera, size: int) -> float:
+    """Pixels that something at distance 1 and of size 1 covers."""
+    return size / 2 / np.tan(np.radians(camera.fov) / 2)
 
 
 def _distances(depth: np.ndarray, camera: Camera) -> np.ndarray:

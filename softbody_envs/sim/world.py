@@ -58,7 +58,7 @@ class World:
         plane = self.client.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=(0, 0, 1))
         return self.client.createMultiBody(0, plane, slab, basePosition=(0, 0, height))
 
-    def add_box_floor(self, half_size: float = 2.0, color: Sequence[float] = (0.85, 0.85, 0.85, 1.0)) -> int:
+    def add_box_floor(self, half_size: float = 5.0, color: Sequence[float] = (0.85, 0.85, 0.85, 1.0)) -> int:
         """
         A thick slab with its top at z = 0, for deformable worlds: on a plane a cloth never settles.
 

@@ -96,7 +96,7 @@ class DropFoldClothEnv(FoldClothEnv):
     * v0: initial version
     """
 
-    camera: ClassVar[Camera] = Camera(position=(0.95, -1.25, 1.1), target=(-0.1, 0.0, 0.3))
+    camera: ClassVar[Camera] = Camera(position=(0.70, -1.00, 1.0), target=(-0.08, 0.0, 0.33))
     workspace: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]] = ((-0.6, -0.6, PICKER_RADIUS), (0.6, 0.6, 1.0))
     fixation_weight: ClassVar[float] = 3.0
     measured_axes: ClassVar[int] = 2

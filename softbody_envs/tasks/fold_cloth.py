@@ -22,6 +22,8 @@ PICKER_HEIGHT = 0.10
 PICKER_OFFSET = 0.10
 #: Range of both sides of the cloth, m.
 SIZES = (0.36, 0.54)
+#: Control steps in which the cloth comes to rest before an episode.
+SETTLE_STEPS = 2
 #: Rows of nodes in each half of the cloth; the middle row belongs to neither.
 N_HALF = N_SIDE // 2
 FACE = (0.86, 0.27, 0.55)
@@ -125,9 +127,8 @@ class FoldClothEnv(SoftbodyEnv):
         grid = flat_grid(length, width, yaw=rng.uniform(-np.pi / 4, np.pi / 4))
         x, y, _ = (grid[0, 0] + grid[0, -1]) / 2
         self._furnish(world, grid, [(x, y - PICKER_OFFSET, PICKER_HEIGHT), (x, y + PICKER_OFFSET, PICKER_HEIGHT)])
-        for _ in range(2 * self.steps_per_control):
-            world.step()
-        self._locate()
+        for _ in range(SETTLE_STEPS):
+            self._control(np.zeros(self.action_size))
         self._place = self._kept()
 
     def _furnish(self, world: World, grid: np.ndarray, pickers: list[tuple[float, float, float]]) -> None:

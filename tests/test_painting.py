@@ -1,0 +1,80 @@
+"""A drawn cloth shows its side, hides what is behind it, and is hidden by what is in front."""
+
+import numpy as np
+import pytest
+
+from softbody_envs.painting import paint_sheet
+from softbody_envs.rendering import Camera
+from softbody_envs.sim.cloth import flat_grid
+
+FACE, UNDERSIDE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+SIZES = (64, 84, 128)
+CAMERA = Camera(position=(0.0, -0.82, 0.82), target=(0.0, 0.0, 0.0))
+
+
+def paint(grid, size=84, camera=CAMERA, depth=1.0):
+    frame = np.full((size, size, 3), 200, np.uint8)
+    paint_sheet(frame, np.broadcast_to(np.float32(depth), (size, size)), camera, grid, FACE, UNDERSIDE)
+    return frame
+
+
+def shows(frame, channel):
+    """Pixels of one of the two colours."""
+    return (frame[..., channel] > 0) & (frame[..., (channel + 1) % 3] == 0) & (frame[..., (channel + 2) % 3] == 0)
+
+
+def buffer_depth(distance, camera=CAMERA):
+    """What a depth buffer holds for a distance in front of the camera."""
+    return camera.far * (distance - camera.near) / (distance * (camera.far - camera.near))
+
+
+def folded(length, width, yaw):
+    grid = flat_grid(length, width, yaw)
+    grid[: len(grid) // 2] = grid[: len(grid) // 2 : -1]
+    return grid
+
+
+@pytest.mark.parametrize("size", (*SIZES, 480))
+def test_each_side_has_its_colour(size):
+    above = paint(flat_grid(0.4, 0.5), size)
+    below = paint(flat_grid(0.4, 0.5), size, Camera(position=(0.0, -0.82, -0.82), target=(0.0, 0.0, 0.0)))
+    assert shows(above, 0).any() and not shows(above, 2).any()
+    assert shows(below, 2).any() and not shows(below, 0).any()
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("yaw", [-0.7, 0.0, 0.5])
+def test_a_sheet_has_no_holes(size, yaw):
+    cloth = shows(paint(flat_grid(0.5, 0.4, yaw), size), 0)
+    assert 0.05 < cloth.mean() < 0.5
+    for row in cloth:
+        columns = np.flatnonzero(row)
+        assert len(columns) == 0 or len(columns) == np.ptp(columns) + 1
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("yaw", [-0.7, 0.0, 0.5])
+def test_a_fold_shows_the_underside_and_nothing_shines_through(size, yaw):
+    frame = paint(folded(0.5, 0.4, yaw), size)
+    face, underside = shows(frame, 0), shows(frame, 2)
+    assert underside.sum() > 20 * face.sum()
+
+
+def test_what_stands_in_front_hides_the_sheet_and_what_is_behind_does_not():
+    depth = np.full((84, 84), buffer_depth(3.0), np.float32)
+    depth[:, 42:] = buffer_depth(0.5)
+    cloth = shows(paint(flat_grid(0.5, 0.5), depth=depth), 0)
+    assert cloth[:, :42].any() and not cloth[:, 42:].any()
+
+
+def test_light_and_shade_tell_slopes_apart():
+    flat, tilted = flat_grid(0.4, 0.4), flat_grid(0.4, 0.4)
+    tilted[..., 2] += 0.5 * tilted[..., 1]
+    brightness = [frame[shows(frame, 0)][:, 0].mean() for frame in (paint(flat), paint(tilted))]
+    assert abs(brightness[0] - brightness[1]) > 10
+
+
+@pytest.mark.parametrize("shift", [(0.6, 0.0, 0.0), (0.0, -1.0, 1.0), (9.0, 9.0, 9.0)])
+def test_a_sheet_may_leave_the_image(shift):
+    frame = paint(flat_grid(0.5, 0.5) + np.array(shift))
+    assert frame.shape == (84, 84, 3)

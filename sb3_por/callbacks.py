@@ -8,8 +8,10 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_por.evaluation import Episode, Evaluation, run_episodes
+from sb3_por.checkpoints import save_checkpoint
+from sb3_por.evaluation import Episode, Evaluation, run_episodes, score
 from sb3_por.files import atomic_write
+from sb3_por.rng import set_rng_state
 from sb3_por.runs import EVALUATIONS
 
 
@@ -68,6 +70,19 @@ class EvaluationCallback(EvalCallback):
 
     def _on_training_start(self) -> None:
         self._started = time.monotonic()
+        file = self.run / EVALUATIONS
+        if self.num_timesteps > 0 and file.is_file():
+            self._take_up(file)
+
+    def _take_up(self, file: Path) -> None:
+        """A resumed run keeps the evaluations up to the step that it goes on from."""
+        with np.load(file) as arrays:
+            kept = arrays["timesteps"] <= self.num_timesteps
+            self._history = {name: list(arrays[name][kept]) for name in arrays.files}
+        if kept.any():
+            self._seconds_before = float(self._history["wall_clock_s"][-1])
+            rows = zip(self._history["normalized_performance"], self._history["results"], strict=True)
+            self.best_mean_reward = max(score(performance, returns) for performance, returns in rows)
 
     def _on_step(self) -> bool:
         return self._evaluate() if is_due(self, self.eval_freq) else True
@@ -124,19 +139,42 @@ class EvaluationCallback(EvalCallback):
 
 class CheckpointCallback(BaseCallback):
     """
-    Saves the model as ``rl_model_<steps>_steps.zip`` at regular intervals; a file is whole or absent.
+    At regular intervals, saves the model as ``rl_model_<steps>_steps.zip`` and all that a killed run needs to go on.
 
-    :param save_freq: interval in environment steps
+    Between two rollouts, when every transition is stored and every update is done; there it also ends the training that
+    a signal asked to stop.
+
+    :param save_freq: interval in environment steps; with 0 only when training is stopped
     :param run: the run's folder
+    :param env_id: the environment
+    :param rng_state: states of the random generators to begin with
     """
 
-    def __init__(self, save_freq: int, run: str | Path) -> None:
+    def __init__(self, save_freq: int, run: str | Path, env_id: str, rng_state: dict[str, Any] | None = None) -> None:
         super().__init__()
         self.save_freq = save_freq
         self.run = Path(run)
+        self.env_id = env_id
+        self.rng_state = rng_state
+        self.stop_requested = False
+
+    def _on_training_start(self) -> None:
+        self._n_due = self._count_due()
+        if self.rng_state is not None:
+            set_rng_state(self.rng_state, self.model.action_space)
+
+    def _on_rollout_start(self) -> None:
+        if self._count_due() > self._n_due:
+            self._n_due = self._count_due()
+            with atomic_write(self.run / f"rl_model_{self.model.num_timesteps}_steps.zip") as path:
+                self.model.save(path)
+            save_checkpoint(self.model, self.run, self.env_id)
+        if self.stop_requested:
+            save_checkpoint(self.model, self.run, self.env_id)
+            raise KeyboardInterrupt
 
     def _on_step(self) -> bool:
-        if is_due(self, self.save_freq):
-            with atomic_write(self.run / f"rl_model_{self.num_timesteps}_steps.zip") as path:
-                self.model.save(path)
         return True
+
+    def _count_due(self) -> int:
+        return self.model.num_timesteps // self.save_freq if self.save_freq > 0 else 0

@@ -25,8 +25,8 @@ def exit_code(command: Callable[[], object], prog: str) -> int:
     except UserError as error:
         print(f"{prog}: error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print(f"{prog}: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"{prog}: {interrupt or 'interrupted'}", file=sys.stderr)
         return 130
     return 0
 

@@ -1,6 +1,6 @@
 """Evaluation on held-out variations with fixed seeds: the same episodes for every method, seed and checkpoint."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -69,8 +69,7 @@ class Evaluation:
     @property
     def score(self) -> float:
         """Mean normalized performance; mean return for environments that report none. Checkpoints are ranked by it."""
-        mean = float(np.mean(self.normalized_performance))
-        return float(np.mean(self.returns)) if np.isnan(mean) else mean
+        return score(self.normalized_performance, self.returns)
 
     def as_dict(self) -> dict[str, Any]:
         """Means and the single episodes, for JSON: ``None`` stands for NaN."""
@@ -93,6 +92,12 @@ class Evaluation:
             parts.append(f"success {np.mean(self.successes):.0%}")
         episodes = f"{len(self.returns)} episode{'s' if len(self.returns) > 1 else ''}"
         return f"{', '.join(parts)}, length {np.mean(self.lengths):.0f} ({episodes})"
+
+
+def score(normalized_performance: Sequence[float], returns: Sequence[float]) -> float:
+    """See :attr:`Evaluation.score`."""
+    mean = float(np.mean(normalized_performance))
+    return float(np.mean(returns)) if np.isnan(mean) else mean
 
 
 class FixedEpisodes(gym.Wrapper):

@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from sb3_por.errors import UserError
+from sb3_por.files import atomic_write
 
 EVALUATIONS = "evaluations.npz"
 
@@ -22,7 +23,8 @@ _PlainDumper.add_multi_representer(dict, lambda dumper, value: dumper.represent_
 
 def write_settings(path: Path, settings: dict[str, Any]) -> None:
     """Write ``args.yml`` or ``config.yml`` of a run as plain YAML."""
-    path.write_text(yaml.dump(settings, Dumper=_PlainDumper))
+    with atomic_write(path) as temporary:
+        temporary.write_text(yaml.dump(settings, Dumper=_PlainDumper))
 
 
 def read_settings(path: Path) -> dict[str, Any]:

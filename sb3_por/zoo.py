@@ -8,6 +8,7 @@ import argparse
 import importlib
 import os
 import shutil
+import signal
 import sys
 import types
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 import rl_zoo3.train
 import yaml
+from filelock import FileLock, Timeout
 from gymnasium import spaces
 from rl_zoo3 import ALGOS
 from rl_zoo3.callbacks import SaveVecNormalizeCallback
@@ -31,14 +33,17 @@ from stable_baselines3.common.vec_env import VecEnv
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import ALGORITHMS
 from sb3_por.callbacks import CheckpointCallback, EvaluationCallback
+from sb3_por.checkpoints import latest_checkpoint, read_rng_state, remove_checkpoints, restore_buffer
 from sb3_por.errors import UserError, check_known, exit_code, one_line
 from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged
 from sb3_por.files import atomic_write, check_writable
 from sb3_por.loading import model_file, read_data
-from sb3_por.runs import current_commit, write_settings
+from sb3_por.runs import current_commit, read_settings, run_arguments, write_settings
 
 EXAMPLE = """example:
   python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:0.1 pairing:paper
+
+  python train.py --resume logs/sac_por/PourWater-v0_1
 
 Settings come from zoo_hyperparams/<algo>.yml, else from the RL Zoo's file of the algorithm. The run goes to
 <log-folder>/<algo>/<env>_<n>: best_model.zip, evaluations.npz, checkpoints, tb/ for TensorBoard."""
@@ -104,7 +109,10 @@ class Parser(argparse.ArgumentParser):
 
     def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]
         self.set_defaults(**DEFAULTS, progress=sys.stderr.isatty())
+        self.add_argument("--resume", metavar="RUN_FOLDER", help="go on with a killed run; its folder has the settings")
         args = super().parse_args()
+        if args.resume:
+            return self._resumed(Path(args.resume))
         check_known("algorithm", args.algo, ALGOS)
         for module in args.gym_packages:
             try:
@@ -120,6 +128,23 @@ class Parser(argparse.ArgumentParser):
             _check_hyperparameters(Path(args.conf_file), args.env)
         check_writable(args.log_folder)
         args.commit = current_commit()
+        return args
+
+    def _resumed(self, run: Path) -> argparse.Namespace:
+        """The arguments that a run was started with, changed by those given now."""
+        saved = run_arguments(run)
+        if "env" not in saved:
+            raise UserError(f"{run} is not the folder of a run: no */args.yml in it; give <log-folder>/<algo>/<env>_<n>")
+        checkpoint = latest_checkpoint(run)
+        if checkpoint is None and (run / f"{saved['env']}.zip").exists():
+            print(f"{run} is finished: nothing to do")
+            raise SystemExit(0)
+        self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
+        args = super().parse_args()
+        for module in args.gym_packages:
+            importlib.import_module(module)
+        args.trained_agent = str(checkpoint / "model.zip") if checkpoint else ""
+        check_writable(run)
         return args
 
 
@@ -169,11 +194,17 @@ class Experiment(ExperimentManager):
         super().__init__(*args, **kwargs)
         self._uuid = kwargs["uuid_str"]
         self._folder_made = False
+        self._resumed_run = Path(self.args.resume) if self.args.resume else None
+        self._interrupted = False
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """``--env-kwargs`` adds to the file's (the zoo's replaces them all), and evaluation gets them too."""
         given, self.env_kwargs = self.env_kwargs, {}
-        hyperparams, saved = super().read_hyperparameters()
+        if self._resumed_run is None:
+            hyperparams, saved = super().read_hyperparameters()
+        else:
+            saved = read_settings(self._resumed_run / self.env_name / "config.yml")
+            hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         held_out = evaluation_kwargs(self.env_name.gym_id)
         self.eval_env_kwargs = {**self.env_kwargs, **held_out, **(self._eval_env_kwargs_args or {})}
@@ -181,7 +212,7 @@ class Experiment(ExperimentManager):
 
     def create_log_folder(self) -> None:
         """The zoo looks for a free number and makes the folder later: runs started together would share it."""
-        while True:
+        while self._resumed_run is None:
             run_id = get_latest_run_id(self.log_path, self.env_name) + 1
             self.save_path = os.path.join(self.log_path, f"{self.env_name}_{run_id}{self._uuid}")
             try:
@@ -189,11 +220,24 @@ class Experiment(ExperimentManager):
                 break
             except FileExistsError:
                 continue
+        if self._resumed_run is not None:
+            self.save_path = str(self._resumed_run)
+            # Monitor begins its file anew by default.
+            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": not self.continue_training}
         self.params_path = os.path.join(self.save_path, self.env_name)
-        os.makedirs(self.params_path)
-        self._folder_made = True
+        os.makedirs(self.params_path, exist_ok=True)
+        self._folder_made = self._resumed_run is None
+        self._lock_folder()
         if self.tensorboard_log is None and not self.optimize_hyperparameters:
             self.tensorboard_log = os.path.join(self.save_path, "tb")
+
+    def _lock_folder(self) -> None:
+        """Two processes must not write one run. The system frees the lock of a killed one."""
+        self._lock = FileLock(os.path.join(self.save_path, ".lock"))
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout as error:
+            raise UserError(f"another process is at work in {self.save_path}") from error
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """Settings that cannot work leave one line and no folder."""
@@ -222,8 +266,6 @@ class Experiment(ExperimentManager):
         """Our evaluation and checkpoints, counted in environment steps."""
         if self.show_progress:
             self.callbacks.append(ProgressBarCallback())
-        if self.save_freq > 0:
-            self.callbacks.append(CheckpointCallback(self.save_freq, self.save_path))
         if self.eval_freq > 0 and not self.optimize_hyperparameters:
             self.callbacks.append(
                 EvaluationCallback(
@@ -235,6 +277,24 @@ class Experiment(ExperimentManager):
                     verbose=self.verbose,
                 )
             )
+        if not self.optimize_hyperparameters:
+            checkpoint = Path(self.trained_agent).parent if self._goes_on else None
+            rng_state = read_rng_state(checkpoint) if checkpoint else None
+            self._checkpoints = CheckpointCallback(self.save_freq, self.save_path, self.env_name.gym_id, rng_state)
+            self.callbacks.append(self._checkpoints)
+
+    @property
+    def _goes_on(self) -> bool:
+        """Whether this is a resumed run that has a checkpoint."""
+        return self._resumed_run is not None and self.continue_training
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        """From a checkpoint, the replay buffer, too; and scenes that were not drawn at the beginning of the run."""
+        model = super()._load_pretrained_agent(hyperparams, env)
+        if self._goes_on:
+            restore_buffer(model, Path(self.trained_agent).parent)
+            env.seed((self.seed + model.num_timesteps) % 2**32)
+        return model
 
     def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> dict[str, Any]:
         """The zoo's last step before it builds the model: see that the policy fits the observations."""
@@ -244,19 +304,25 @@ class Experiment(ExperimentManager):
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         """Plain YAML; the zoo writes Python objects, which only an unsafe loader reads."""
         write_settings(Path(self.params_path) / "config.yml", dict(sorted(saved_hyperparams.items())))
-        write_settings(Path(self.params_path) / "args.yml", dict(sorted(vars(self.args).items())))
+        args = {**vars(self.args), "resume": None, "trained_agent": "" if self._goes_on else self.args.trained_agent}
+        write_settings(Path(self.params_path) / "args.yml", dict(sorted(args.items())))
         (Path(self.params_path) / "command.txt").write_text(" ".join(sys.orig_argv))
         print(f"Log path: {self.save_path}")
 
     def learn(self, model: BaseAlgorithm) -> None:
-        """A resumed run goes on counting: the zoo's would repeat its schedules and its random warm-up."""
+        """
+        A resumed run goes on counting: the zoo's would repeat its schedules and its random warm-up. Ctrl-C and SIGTERM end
+        it at the next safe place.
+        """
         kwargs: dict[str, Any] = {"callback": self.callbacks, "reset_num_timesteps": not self.continue_training}
         if self.log_interval != -1:
             kwargs["log_interval"] = self.log_interval if self.log_interval > -1 else None
+        n_timesteps = self.n_timesteps - (model.num_timesteps if self._goes_on else 0)
+        handlers = {number: signal.signal(number, self._request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            model.learn(self.n_timesteps, **kwargs)
+            model.learn(n_timesteps, **kwargs)
         except KeyboardInterrupt:
-            print(f"Interrupted at step {model.num_timesteps}: the model is saved.", file=sys.stderr)
+            self._interrupted = True
         except ValueError as error:
             if not has_diverged(model):
                 raise
@@ -265,7 +331,15 @@ class Experiment(ExperimentManager):
                 f"{self.save_path} before is sound; a lower learning_rate may help"
             ) from error
         finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
             self._close(model)
+
+    def _request_stop(self, number: int, frame: Any) -> None:
+        """The first signal waits for a safe place, the second does not."""
+        if self._checkpoints.stop_requested:
+            raise KeyboardInterrupt
+        self._checkpoints.stop_requested = True
 
     def _close(self, model: BaseAlgorithm) -> None:
         for callback in self.callbacks:
@@ -288,6 +362,11 @@ class Experiment(ExperimentManager):
         if statistics is not None:
             statistics.save(os.path.join(self.params_path, "vecnormalize.pkl"))
         print(f"Saved to {self.save_path}")
+        if self._interrupted:
+            raise KeyboardInterrupt(
+                f"interrupted at step {model.num_timesteps}; go on with: python train.py --resume {self.save_path}"
+            )
+        remove_checkpoints(Path(self.save_path))
 
 
 if __name__ == "__main__":

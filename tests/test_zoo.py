@@ -1,5 +1,7 @@
 """train.py: the zoo's command with our algorithms, tasks, evaluation and messages."""
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -26,7 +28,7 @@ SMALL = ["-params", "learning_starts:50", "buffer_size:1000", "batch_size:16"]
 
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory):
-    """A run of SAC on Pendulum: 400 steps, evaluated at 150, 300 and the end, checkpoints at 200 and 400."""
+    """A run of SAC on Pendulum: 400 steps, evaluated at 150, 300 and the end, a checkpoint at 200."""
     folder = tmp_path_factory.mktemp("logs")
     flags = ["-n", "400", "--eval-freq", "150", "--save-freq", "200", "--save-replay-buffer", "-f", str(folder)]
     assert main([*PENDULUM, *flags, *SMALL]) == 0
@@ -42,13 +44,13 @@ def test_a_run_leaves_the_zoos_files(finished_run):
         "evaluations.npz",
         "replay_buffer.pkl",
         "rl_model_200_steps.zip",
-        "rl_model_400_steps.zip",
         "Pendulum-v1/args.yml",
         "Pendulum-v1/config.yml",
         "Pendulum-v1/command.txt",
     }
     assert list(finished_run.glob("tb/SAC_1/events*"))
-    assert not [name for name in files if name.startswith(".")]
+    assert {name for name in files if "/." in f"/{name}"} <= {".lock"}
+    assert not (finished_run / "checkpoint").exists()
     assert load_model(finished_run / "Pendulum-v1.zip").num_timesteps == 400
 
 
@@ -110,7 +112,7 @@ def test_runs_started_together_get_folders_of_their_own(tmp_path, monkeypatch):
     numbers = [0, 0, 1]
     for experiment in experiments:
         experiment.log_path, experiment.env_name, experiment._uuid = str(tmp_path), "E-v0", ""
-        experiment.tensorboard_log, experiment.optimize_hyperparameters = None, False
+        experiment.tensorboard_log, experiment.optimize_hyperparameters, experiment._resumed_run = None, False, None
         experiment.create_log_folder()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["E-v0_1", "E-v0_2"]
     assert experiments[1].tensorboard_log == str(tmp_path / "E-v0_2" / "tb")
@@ -153,18 +155,25 @@ def test_training_that_diverges_is_one_line_and_keeps_the_checkpoints(tmp_path, 
     assert load_model(run / "best_model.zip").num_timesteps == 60
 
 
-def test_ctrl_c_saves_the_model(tmp_path, capsys, monkeypatch):
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
     class Interrupt(BaseCallback):
         def _on_step(self):
-            if self.num_timesteps == 30:
-                raise KeyboardInterrupt
+            if self.num_timesteps == 130:
+                os.kill(os.getpid(), signal.SIGINT)
             return True
 
     create = Experiment.create_callbacks
     monkeypatch.setattr(Experiment, "create_callbacks", lambda self: (create(self), self.callbacks.append(Interrupt())))
-    assert main([*PENDULUM, "-n", "400", "-f", str(tmp_path), *SMALL]) == 0
-    assert "Interrupted at step 30: the model is saved." in capsys.readouterr().err
-    assert load_model(tmp_path / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip").num_timesteps == 30
+    assert main([*PENDULUM, "-n", "160", "--eval-freq", "80", "-f", str(tmp_path), *SMALL]) == 130
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    last_line = capsys.readouterr().err.splitlines()[-1]
+    assert last_line == f"train.py: interrupted at step 130; go on with: python train.py --resume {run}"
+    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 130
+    monkeypatch.undo()
+    assert main(["--resume", str(run)]) == 0
+    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 160
+    with np.load(run / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [80, 160]
 
 
 def test_settings_are_ours_then_the_zoos_then_our_default():

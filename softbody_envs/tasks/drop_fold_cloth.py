@@ -33,7 +33,7 @@ class DropFoldClothEnv(FoldClothEnv):
     `Box(-1, 1, (8,), float32)`, as in `FoldCloth-v0`: x, y, z and pick of picker 0, then of picker 1. The pickers hold
     the cloth at first; the first action decides whether they keep it: a pick of 0 or less drops it.
 
-    The centres of the pickers stay within x, y = -0.6 to 0.6 m and z = 0.05 to 1 m.
+    The centres of the pickers stay within x = -0.6 to 0.3 m, y = -0.45 to 0.45 m and z = 0.05 to 0.85 m.
 
     ## Observation Space
 
@@ -97,7 +97,7 @@ class DropFoldClothEnv(FoldClothEnv):
     """
 
     camera: ClassVar[Camera] = Camera(position=(0.70, -1.00, 1.0), target=(-0.08, 0.0, 0.33))
-    workspace: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]] = ((-0.6, -0.6, PICKER_RADIUS), (0.6, 0.6, 1.0))
+    workspace: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]] = ((-0.6, -0.45, PICKER_RADIUS), (0.3, 0.45, 0.85))
     fixation_weight: ClassVar[float] = 3.0
     measured_axes: ClassVar[int] = 2
 

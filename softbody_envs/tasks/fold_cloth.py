@@ -51,7 +51,7 @@ class FoldClothEnv(SoftbodyEnv):
     | 4, 5, 6 | move picker 1 along x, y, z | 0.08 m in one step |
     | 7 | pick | as 3 |
 
-    The centres of the pickers stay within x, y = -0.6 to 0.6 m and z = 0.05 to 0.45 m. Two pickers that hold the cloth
+    The centres of the pickers stay within x, y = -0.45 to 0.45 m and z = 0.05 to 0.4 m. Two pickers that hold the cloth
     cannot be sent further apart than 1.1 times the distance of what they hold in the flat cloth.
 
     ## Observation Space
@@ -92,7 +92,8 @@ class FoldClothEnv(SoftbodyEnv):
     ## Differences from SoftGym
 
     * 81 nodes instead of 3600 to 14161, and sides of 0.36 to 0.54 m instead of 0.37 to 0.74 m: the whole cloth is in
-      the image and within reach of the pickers, whose box lies about the cloth's middle.
+      the image and within reach of the pickers, whose box is smaller and about the cloth's middle. The camera stands a
+      little further off.
     * Layers do not collide with each other: they lie in each other, and a perfect fold scores 1 but for what moved.
     * Pickers do not push the cloth, and they cannot tear it apart (SoftGym has a guard against that, switched off).
     * The state also says which picker holds something.
@@ -103,7 +104,7 @@ class FoldClothEnv(SoftbodyEnv):
     * v0: initial version
     """
 
-    camera: ClassVar[Camera] = Camera(position=(0.0, -0.82, 0.82), target=(0.0, 0.0, 0.0))
+    camera: ClassVar[Camera] = Camera(position=(0.0, -0.92, 0.95), target=(0.0, 0.0, 0.03))
     action_size: ClassVar[int] = 8
     state_names: ClassVar[tuple[str, ...]] = (
         *(f"corner {corner} {axis}" for corner in range(4) for axis in "xyz"),
@@ -116,7 +117,7 @@ class FoldClothEnv(SoftbodyEnv):
     deformable: ClassVar[bool] = True
 
     #: Lowest and highest corner of the box that the centres of the pickers stay in, m.
-    workspace: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]] = ((-0.6, -0.6, PICKER_RADIUS), (0.6, 0.6, 0.45))
+    workspace: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]] = ((-0.45, -0.45, PICKER_RADIUS), (0.45, 0.45, 0.40))
     #: Weight of how far the lower half is from its place against how far apart the halves are.
     fixation_weight: ClassVar[float] = 1.2
     #: How many of x, y, z these distances have.
@@ -135,7 +136,7 @@ class FoldClothEnv(SoftbodyEnv):
         """Put a floor, a cloth at rest and two pickers into the world."""
         world.add_box_floor()
         self.cloth = Cloth(world, grid)
-        low, high = self.workspace
+        low, high = np.array(self.workspace)
         self.pickers = Pickers(world, self.cloth, np.array(pickers), low, high, PICKER_RADIUS, GRASP_RANGE, mass=PICKER_MASS)
 
     def _control(self, action: np.ndarray) -> None:

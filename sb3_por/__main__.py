@@ -27,13 +27,13 @@ class Command:
     :param help: one line
     :param example: arguments of a call that works
     :param add_arguments: gives the arguments to its parser
-    :param run: carries it out
+    :param run: carries it out; may return an exit code
     """
 
     help: str
     example: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], None]
+    run: Callable[[argparse.Namespace], object]
 
 
 def _model_arguments(parser: argparse.ArgumentParser) -> None:
@@ -116,6 +116,18 @@ def _plot(args: argparse.Namespace) -> None:
     print(args.output)
 
 
+def _suite_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("suite", metavar="SUITE.yml", help="algos, envs, seeds, and what else a suite says")
+    parser.add_argument("--root", default="runs", help="runs go to <root>/<suite>/<env>/<algo>/seed_<seed> (default runs)")
+    parser.add_argument("--dry-run", action="store_true", help="print the runs and their states, and do nothing")
+
+
+def _suite(args: argparse.Namespace) -> int:
+    from sb3_por.suite import run_suite
+
+    return run_suite(args.suite, args.root, args.dry_run)
+
+
 COMMANDS = {
     "evaluate": Command(
         help="play held-out episodes and print the scores",
@@ -134,6 +146,12 @@ COMMANDS = {
         example="logs/sac_por logs/sac -o curve.png --csv scores.csv",
         add_arguments=_plot_arguments,
         run=_plot,
+    ),
+    "suite": Command(
+        help="run what is left to do of a grid of algorithms, environments and seeds",
+        example="suites/smoke.yml --dry-run",
+        add_arguments=_suite_arguments,
+        run=_suite,
     ),
 }
 
@@ -158,9 +176,9 @@ def main(arguments: list[str] | None = None) -> int:
     :return: the exit code
     """
 
-    def command() -> None:
+    def command() -> object:
         args = _parse(arguments)
-        COMMANDS[args.command].run(args)
+        return COMMANDS[args.command].run(args)
 
     return exit_code(command, "python -m sb3_por")
 

@@ -15,8 +15,8 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_por.files import atomic_write
 from sb3_por.rng import get_rng_state
+from sb3_por.runs import CHECKPOINTS
 
-FOLDER = "checkpoint"
 #: Bytes of a replay buffer that are stored together; only blocks that changed are written again.
 BLOCK_SIZE = 4 * 2**20
 
@@ -33,7 +33,7 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str) -> Path:
     :param env_id: names the folder of ``VecNormalize`` statistics, as in the zoo
     :return: the new folder
     """
-    root = run / FOLDER
+    root = run / CHECKPOINTS
     final = root / f"step_{model.num_timesteps}"
     if final.exists():
         return final
@@ -65,13 +65,13 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str) -> Path:
 
 def latest_checkpoint(run: Path) -> Path | None:
     """The newest complete checkpoint of a run, if it has one."""
-    found = (run / FOLDER).glob("step_*")
+    found = (run / CHECKPOINTS).glob("step_*")
     return max(found, key=lambda folder: int(folder.name.removeprefix("step_")), default=None)
 
 
 def remove_checkpoints(run: Path) -> None:
     """A finished run needs none."""
-    shutil.rmtree(run / FOLDER, ignore_errors=True)
+    shutil.rmtree(run / CHECKPOINTS, ignore_errors=True)
 
 
 def restore_buffer(model: BaseAlgorithm, checkpoint: Path) -> None:

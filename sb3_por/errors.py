@@ -18,17 +18,18 @@ def exit_code(command: Callable[[], object], prog: str) -> int:
 
     :param command: called without arguments
     :param prog: what the user typed, starts the message
-    :return: 0, or 2 after a ``UserError``, shown as one line on stderr, or 130 after Ctrl-C
+    :return: what the command returns if that is a number, else 0; 2 after a ``UserError``, shown as one line on stderr;
+        130 after Ctrl-C
     """
     try:
-        command()
+        result = command()
     except UserError as error:
         print(f"{prog}: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
         print(f"{prog}: {interrupt or 'interrupted'}", file=sys.stderr)
         return 130
-    return 0
+    return result if isinstance(result, int) else 0
 
 
 def check_known(kind: str, name: str, known: Iterable[str]) -> None:

@@ -5,12 +5,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from sb3_por.errors import UserError
 from sb3_por.files import atomic_write
 
 EVALUATIONS = "evaluations.npz"
+#: Folder of what a killed run goes on from; a finished run has none.
+CHECKPOINTS = "checkpoint"
 
 
 class _PlainDumper(yaml.SafeDumper):
@@ -42,6 +45,28 @@ def run_arguments(run: Path) -> dict[str, Any]:
     """The command-line arguments of a run; empty if they were not recorded."""
     files = sorted(run.glob("*/args.yml"))
     return read_settings(files[0]) if files else {}
+
+
+def is_finished(run: Path, env_id: str) -> bool:
+    """Whether a run has its last model and no checkpoint to go on from."""
+    return (run / f"{env_id}.zip").exists() and not (run / CHECKPOINTS).exists()
+
+
+def progress(run: Path) -> tuple[int, float | None]:
+    """
+    :return: steps that the run has done, to the last episode's end, and its latest mean normalized performance
+    """
+    steps = 0
+    for monitor in run.glob("*.monitor.csv"):
+        rows = (line.split(",") for line in monitor.read_text().splitlines()[2:])
+        steps += sum(int(row[1]) for row in rows if len(row) > 2)
+    score = None
+    if (run / EVALUATIONS).is_file():
+        with np.load(run / EVALUATIONS) as file:
+            steps = max(steps, int(file["timesteps"][-1]))
+            latest = float(np.mean(file["normalized_performance"][-1]))
+        score = None if np.isnan(latest) else latest
+    return steps, score
 
 
 def find_runs(paths: Iterable[str | Path]) -> list[Path]:

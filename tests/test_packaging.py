@@ -13,6 +13,9 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from sb3_por import ALGORITHMS
+from softbody_envs import ENV_IDS
+
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("sb3_por", "softbody_envs")
 
@@ -129,6 +132,11 @@ def test_make_installs_once(tmp_path):
     stamp.touch()
     again = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True).stdout
     assert again.strip() == f"{tmp_path}/venv/bin/python train.py --algo sac_por --env PourWater-v0 -n 5"
+
+
+def test_the_readme_lists_every_task_and_algorithm():
+    rows = re.findall(r"^\| `([^`]+)` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert set(rows) == {*ENV_IDS, *ALGORITHMS, "sac"}
 
 
 def test_the_readme_begins_with_the_two_commands():

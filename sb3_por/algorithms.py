@@ -7,11 +7,39 @@ from sb3_por.objectives.por import PartialOrder
 from sb3_por.visual_sac import VisualSAC
 
 
-class WithPartialOrder:
+class ReferenceSettings:
+    """
+    Defaults of the references, CURL and DrQ, where they differ from SB3's. A mixin; all of it can be set.
+
+    :param actor_update_interval: Update actor and temperature every that many updates
+    :param target_update_interval: Update the target networks every that many updates
+    :param encoder_tau: Soft update coefficient of the momentum encoder f_m
+    :param tau: Soft update coefficient of the target Q networks
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        actor_update_interval: int = 2,
+        target_update_interval: int = 2,
+        encoder_tau: float | None = 0.05,
+        tau: float = 0.01,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            *args,
+            actor_update_interval=actor_update_interval,
+            target_update_interval=target_update_interval,
+            encoder_tau=encoder_tau,
+            tau=tau,
+            **kwargs,
+        )
+
+
+class WithPartialOrder(ReferenceSettings):
     """
     Adds the POR objective to a visual actor-critic. A mixin; takes the arguments of the algorithm and
 
-    :param encoder_tau: Soft update coefficient of the momentum encoder f_m
     :param por_coef: Weight lambda of the POR loss
     :param pairing: ``"paper"``, or ``"swap"``, which keeps the classifier from telling the two encoders apart
     :param order_head: The classifier: ``"mlp"`` (the paper's), ``"difference"`` or ``"coordinatewise"``
@@ -24,7 +52,6 @@ class WithPartialOrder:
     def __init__(
         self,
         *args: Any,
-        encoder_tau: float | None = 0.05,
         por_coef: float = 0.1,
         pairing: str = "swap",
         order_head: str = "mlp",
@@ -41,7 +68,7 @@ class WithPartialOrder:
         self.order_hidden_dim = order_hidden_dim
         self.k = k
         self.random_k = random_k
-        super().__init__(*args, encoder_tau=encoder_tau, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _objective(self) -> tuple[type[Objective], dict[str, Any]]:
         return PartialOrder, dict(

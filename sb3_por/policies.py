@@ -1,5 +1,6 @@
 """Policies whose critic owns the encoder; the actor sees the detached trunk through a projection of its own."""
 
+import math
 from typing import Any
 
 import torch as th
@@ -31,6 +32,10 @@ class VisualActor(Actor):
         super().__init__(*args, **kwargs)
         self.detach_trunk = detach_trunk
         self.projection = make_projection(self.features_extractor)
+        if not self.use_sde:
+            # Exploration starts with a standard deviation of about 1, as in SB3, not in the middle of the range, e^-4
+            middle, half_range = 0.5 * (LOG_STD_MAX + LOG_STD_MIN), 0.5 * (LOG_STD_MAX - LOG_STD_MIN)
+            nn.init.constant_(self.log_std.bias, math.atanh(-middle / half_range))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "detach_trunk": self.detach_trunk}

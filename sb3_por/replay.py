@@ -251,7 +251,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         self.rewards[self.pos] = reward
         self.dones[self.pos] = done
         if self.handle_timeout_termination:
-            self.timeouts[self.pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+            self.timeouts[self.pos] = np.array([info.get("TimeLimit.truncated", False) for info in infos]).reshape(-1)
         self.ended[self.pos] = False
         for env in np.flatnonzero(done):
             self._end_episode(self.pos, int(env))

@@ -96,7 +96,10 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self) -> None:
         super().__init__(
-            prog="train.py", description=__doc__, epilog=EXAMPLE, formatter_class=argparse.RawDescriptionHelpFormatter
+            prog="train.py",
+            description="Train an agent, with the RL Zoo's flags.",
+            epilog=EXAMPLE,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
 
     def error(self, message: str) -> Any:
@@ -114,11 +117,7 @@ class Parser(argparse.ArgumentParser):
         if args.resume:
             return self._resumed(Path(args.resume))
         check_known("algorithm", args.algo, ALGOS)
-        for module in args.gym_packages:
-            try:
-                importlib.import_module(module)
-            except ImportError as error:
-                raise UserError(f"--gym-packages: {one_line(error)}") from error
+        _import_packages(args.gym_packages)
         check_known("environment", args.env, gym.registry)
         if args.trained_agent:
             args.trained_agent = str(model_file(args.trained_agent))
@@ -135,17 +134,22 @@ class Parser(argparse.ArgumentParser):
         saved = run_arguments(run)
         if "env" not in saved:
             raise UserError(f"{run} is not the folder of a run: no */args.yml in it; give <log-folder>/<algo>/<env>_<n>")
-        checkpoint = latest_checkpoint(run)
         if is_finished(run, saved["env"]):
             print(f"{run} is finished: nothing to do")
             raise SystemExit(0)
         self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
         args = super().parse_args()
-        for module in args.gym_packages:
-            importlib.import_module(module)
-        args.trained_agent = str(checkpoint / "model.zip") if checkpoint else ""
+        _import_packages(args.gym_packages)
         check_writable(run)
         return args
+
+
+def _import_packages(names: list[str]) -> None:
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise UserError(f"--gym-packages: {one_line(error)}") from error
 
 
 def hyperparameter_file(algo: str, env_id: str) -> Path:
@@ -194,8 +198,12 @@ class Experiment(ExperimentManager):
         super().__init__(*args, **kwargs)
         self._uuid = kwargs["uuid_str"]
         self._folder_made = False
-        self._resumed_run = Path(self.args.resume) if self.args.resume else None
         self._interrupted = False
+        self._resumed_run = Path(self.args.resume) if self.args.resume else None
+        self._checkpoint = latest_checkpoint(self._resumed_run) if self._resumed_run else None
+        if self._checkpoint:
+            self.trained_agent = str(self._checkpoint / "model.zip")
+            self.continue_training = True
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """``--env-kwargs`` adds to the file's (the zoo's replaces them all), and evaluation gets them too."""
@@ -223,7 +231,7 @@ class Experiment(ExperimentManager):
         if self._resumed_run is not None:
             self.save_path = str(self._resumed_run)
             # Monitor begins its file anew by default.
-            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": not self.continue_training}
+            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": self._checkpoint is None}
         self.params_path = os.path.join(self.save_path, self.env_name)
         os.makedirs(self.params_path, exist_ok=True)
         self._folder_made = self._resumed_run is None
@@ -258,9 +266,11 @@ class Experiment(ExperimentManager):
         inner = self.env_wrapper
         self.env_wrapper = FixedEpisodes if inner is None else lambda env: FixedEpisodes(inner(env))
         try:
-            return super().create_envs(n_envs, eval_env=True, no_log=no_log)
+            env = super().create_envs(n_envs, eval_env=True, no_log=no_log)
         finally:
             self.env_wrapper = inner
+        env.env_method("play", evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes))
+        return env
 
     def create_callbacks(self) -> None:
         """Our evaluation and checkpoints, counted in environment steps."""
@@ -278,21 +288,15 @@ class Experiment(ExperimentManager):
                 )
             )
         if not self.optimize_hyperparameters:
-            checkpoint = Path(self.trained_agent).parent if self._goes_on else None
-            rng_state = read_rng_state(checkpoint) if checkpoint else None
+            rng_state = read_rng_state(self._checkpoint) if self._checkpoint else None
             self._checkpoints = CheckpointCallback(self.save_freq, self.save_path, self.env_name.gym_id, rng_state)
             self.callbacks.append(self._checkpoints)
-
-    @property
-    def _goes_on(self) -> bool:
-        """Whether this is a resumed run that has a checkpoint."""
-        return self._resumed_run is not None and self.continue_training
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         """From a checkpoint, the replay buffer, too; and scenes that were not drawn at the beginning of the run."""
         model = super()._load_pretrained_agent(hyperparams, env)
-        if self._goes_on:
-            restore_buffer(model, Path(self.trained_agent).parent)
+        if self._checkpoint:
+            restore_buffer(model, self._checkpoint)
             env.seed((self.seed + model.num_timesteps) % 2**32)
         return model
 
@@ -304,9 +308,9 @@ class Experiment(ExperimentManager):
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         """Plain YAML; the zoo writes Python objects, which only an unsafe loader reads."""
         write_settings(Path(self.params_path) / "config.yml", dict(sorted(saved_hyperparams.items())))
-        args = {**vars(self.args), "resume": None, "trained_agent": "" if self._goes_on else self.args.trained_agent}
-        write_settings(Path(self.params_path) / "args.yml", dict(sorted(args.items())))
-        (Path(self.params_path) / "command.txt").write_text(" ".join(sys.orig_argv))
+        write_settings(Path(self.params_path) / "args.yml", dict(sorted({**vars(self.args), "resume": None}.items())))
+        if self._resumed_run is None:
+            (Path(self.params_path) / "command.txt").write_text(" ".join(sys.orig_argv))
         print(f"Log path: {self.save_path}")
 
     def learn(self, model: BaseAlgorithm) -> None:
@@ -317,7 +321,9 @@ class Experiment(ExperimentManager):
         kwargs: dict[str, Any] = {"callback": self.callbacks, "reset_num_timesteps": not self.continue_training}
         if self.log_interval != -1:
             kwargs["log_interval"] = self.log_interval if self.log_interval > -1 else None
-        n_timesteps = self.n_timesteps - (model.num_timesteps if self._goes_on else 0)
+        n_timesteps = self.n_timesteps
+        if self._checkpoint:
+            n_timesteps = max(n_timesteps, model._total_timesteps) - model.num_timesteps
         handlers = {number: signal.signal(number, self._request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             model.learn(n_timesteps, **kwargs)
@@ -352,6 +358,10 @@ class Experiment(ExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """Files are whole or absent."""
+        go_on = f"interrupted at step {model.num_timesteps}; go on with: python train.py --resume {self.save_path}"
+        if self._interrupted and latest_checkpoint(Path(self.save_path)) is None:
+            # A model without a checkpoint is what marks a finished run.
+            raise KeyboardInterrupt(go_on)
         save: Callable[[Path], Any] = model.save
         with atomic_write(Path(self.save_path) / f"{self.env_name}.zip") as path:
             save(path)
@@ -363,9 +373,7 @@ class Experiment(ExperimentManager):
             statistics.save(os.path.join(self.params_path, "vecnormalize.pkl"))
         print(f"Saved to {self.save_path}")
         if self._interrupted:
-            raise KeyboardInterrupt(
-                f"interrupted at step {model.num_timesteps}; go on with: python train.py --resume {self.save_path}"
-            )
+            raise KeyboardInterrupt(go_on)
         remove_checkpoints(Path(self.save_path))
 
 

@@ -193,7 +193,7 @@ def test_amount_is_drawn_for_each_variation_and_one_is_reachable():
 
 def test_the_line_is_red_in_the_image_and_as_high_as_the_wanted_water():
     env = make("PourWaterAmount-v0", variation=803)
-    image = env._image(84).astype(int)
+    image = env._image(64).astype(int)
     assert ((image[..., 0] > 150) & (image[..., 1] < 60)).sum() >= 3
     expert = make_expert("PourWaterAmount-v0")
     expert.reset()

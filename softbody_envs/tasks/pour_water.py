@@ -69,7 +69,7 @@ class PourWaterEnv(SoftbodyEnv):
 
     The water at rest in the upright cup at x = 0. A variation draws the cup's floor (4 to 6 by 3 to 4 particles), the
     number of particles (40 to 80), the cup's height (1.15 to 1.6 times the water's, and 2 cm), how much longer, wider and
-    higher the target is (up to 4, 4 and 10 cm), and the gap between the cups (6 to 20 cm).
+    higher the target is (up to 4, 4 and 10 cm), and the gap between the cups (8 to 22 cm).
 
     ## Episode End
 
@@ -94,7 +94,7 @@ class PourWaterEnv(SoftbodyEnv):
     * v0: initial version
     """
 
-    camera: ClassVar[Camera] = Camera(position=(0.22, -1.30, 0.85), target=(0.22, 0.0, 0.31))
+    camera: ClassVar[Camera] = Camera(position=(0.25, -1.32, 0.86), target=(0.25, 0.0, 0.31))
     action_size: ClassVar[int] = 3
     state_names: ClassVar[tuple[str, ...]] = (
         "cup x",
@@ -128,7 +128,7 @@ class PourWaterEnv(SoftbodyEnv):
             width=size.width + rng.uniform(0.0, 0.04),
             height=size.height + rng.uniform(0.0, 0.10),
         )
-        gap = rng.uniform(0.06, 0.20)
+        gap = rng.uniform(0.08, 0.22)
 
         world.client.setPhysicsEngineParameter(
             numSolverIterations=10, contactBreakingThreshold=0.02, minimumSolverIslandSize=1024

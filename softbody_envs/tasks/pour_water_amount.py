@@ -12,6 +12,8 @@ from softbody_envs.tasks.pour_water import PourWaterEnv
 
 #: Share of a filled volume that the spheres themselves take up: poured, frictionless, near walls.
 PACKING = 0.55
+#: Of the line, m: at least a pixel of a 64-pixel image.
+BAR_WIDTH = 0.028
 
 
 class PourWaterAmountEnv(PourWaterEnv):
@@ -86,7 +88,7 @@ class PourWaterAmountEnv(PourWaterEnv):
         size = self.target.size
         self.line = WALL + self.n_wanted * VOLUME / (PACKING * size.length * size.width)
         bar = world.client.createVisualShape(
-            pybullet.GEOM_BOX, halfExtents=(size.length / 2, 0.003, 0.006), rgbaColor=(1.0, 0.0, 0.0, 1.0)
+            pybullet.GEOM_BOX, halfExtents=(size.length / 2, 0.003, BAR_WIDTH / 2), rgbaColor=(1.0, 0.0, 0.0, 1.0)
         )
         world.client.createMultiBody(
             0, baseVisualShapeIndex=bar, basePosition=(self.target.x, size.width / 2 - 0.003, self.line)

@@ -12,8 +12,8 @@ from softbody_envs.sim.world import World
 N_SIDE = 9
 #: kg (SoftGym: 0.5). Only the ratio of the springs to it matters.
 MASS = 0.5
-#: Of the springs between neighbours, N/m. With ``STEPS_PER_CONTROL`` steps a hanging cloth trembles from 1.6 times this on.
-STIFFNESS = 100.0
+#: Of the springs between neighbours, N/m. With ``STEPS_PER_CONTROL`` steps a hanging cloth trembles from 1.5 times this on.
+STIFFNESS = 110.0
 #: Of the springs, N s/m; in all directions, so that a swinging cloth comes to rest within a second, as air would do it.
 DAMPING = 0.05
 BENDING_STIFFNESS = 0.05

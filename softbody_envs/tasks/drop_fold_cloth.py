@@ -61,7 +61,7 @@ class DropFoldClothEnv(FoldClothEnv):
     ## Starting State
 
     The cloth at rest, its lower edge at a height of 0.1 to 0.2 m, its plane through the z axis. A variation draws that
-    height, both sides of the cloth (0.36 to 0.54 m) and the angle between the direction of the fold and x (up to 30
+    height, both sides of the cloth (0.38 to 0.54 m) and the angle between the direction of the fold and x (up to 30
     degrees either way).
 
     ## Episode End

@@ -21,7 +21,7 @@ PICKER_MASS = 100.0
 PICKER_HEIGHT = 0.10
 PICKER_OFFSET = 0.10
 #: Range of both sides of the cloth, m.
-SIZES = (0.36, 0.54)
+SIZES = (0.38, 0.54)
 #: Control steps in which the cloth comes to rest before an episode.
 SETTLE_STEPS = 2
 #: Rows of nodes in each half of the cloth; the middle row belongs to neither.
@@ -77,7 +77,7 @@ class FoldClothEnv(SoftbodyEnv):
     ## Starting State
 
     The cloth flat, its middle at the origin, the pickers 10 cm above the floor, 10 cm to either side of the middle of the
-    edge to carry. A variation draws both sides of the cloth (0.36 to 0.54 m) and its orientation (up to 45 degrees either
+    edge to carry. A variation draws both sides of the cloth (0.38 to 0.54 m) and its orientation (up to 45 degrees either
     way).
 
     ## Episode End
@@ -91,7 +91,7 @@ class FoldClothEnv(SoftbodyEnv):
 
     ## Differences from SoftGym
 
-    * 81 nodes instead of 3600 to 14161, and sides of 0.36 to 0.54 m instead of 0.37 to 0.74 m: the whole cloth is in
+    * 81 nodes instead of 3600 to 14161, and sides of 0.38 to 0.54 m instead of 0.37 to 0.74 m: the whole cloth is in
       the image and within reach of the pickers, whose box is smaller and about the cloth's middle. The camera stands a
       little further off.
     * Layers do not collide with each other: they lie in each other, and a perfect fold scores 1 but for what moved.

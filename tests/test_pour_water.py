@@ -79,7 +79,7 @@ def test_no_particle_passes_a_wall_when_the_expert_pours(episodes):
     assert play(make(), episodes, make_expert("PourWater-v0"))[0] == 0
 
 
-@pytest.mark.parametrize("episodes", [4, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("episodes", [6, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("env_id", WATER_ENVS)
 def test_expert_reaches_its_score_on_held_out_variations(env_id, episodes):
     _, scores = play(make(env_id), episodes, make_expert(env_id), first_variation=800)

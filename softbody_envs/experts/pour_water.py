@@ -17,7 +17,7 @@ SLOWEST_TILT_RATE = 0.015
 
 
 #: What flows now goes on flowing for this many control steps after the cup begins to tilt back.
-FORESIGHT = 3
+FORESIGHT = 4
 #: What still slips out while the cup tilts back, as a share of all water.
 RESERVE = 0.04
 #: Tilted slowly, the cup loses these shares of its water at about these tilts (rad), whatever its size: the spheres lie in
@@ -25,7 +25,7 @@ RESERVE = 0.04
 SHARE_LEFT = (0.0, 0.2, 0.5, 0.8, 1.0)
 TILT_THEN = (1.45, 1.6, 1.69, 1.76, 1.82)
 #: The slow part begins this much before, rad.
-HEADROOM = 0.3
+HEADROOM = 0.25
 
 
 class PourWaterExpert:

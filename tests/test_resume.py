@@ -159,7 +159,7 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(3600)
 def test_ten_kills_at_random_moments(tmp_path):
     assert_finished(kill_and_finish(tmp_path, 10, random.Random(1)))
 

@@ -109,7 +109,7 @@ def test_failures_are_named_and_what_is_finished_is_not_done_again(suite_file, t
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(3600)
 def test_a_suite_of_six_runs_killed_twice_is_finished_by_the_third_start(suite_file, tmp_path):
     text = SMALL_SUITE.replace("overrides: {td3: {colour: blue}}\n", "save_freq: 50\n")
     text = text.replace("seeds: [0]", "seeds: [0, 1, 2]").replace("n_timesteps: 60", "n_timesteps: 400")

@@ -116,6 +116,40 @@ def _plot(args: argparse.Namespace) -> None:
     print(args.output)
 
 
+def _diagnose_arguments(parser: argparse.ArgumentParser) -> None:
+    _model_arguments(parser)
+    parser.add_argument("-n", "--n-episodes", type=int, default=5, help="held-out episodes of each policy (default 5)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
+def _diagnose(args: argparse.Namespace) -> None:
+    from sb3_por.diagnostics import check_order, diagnose
+
+    model, vec_normalize = _load(args)
+    check_order(model)
+    diagnosis = diagnose(model, args.env, args.n_episodes, args.seed, vec_normalize)
+    if args.json:
+        print(json.dumps({"model": args.model, "env": args.env, "seed": args.seed, **diagnosis.as_dict()}, indent=2))
+    else:
+        print(diagnosis)
+
+
+def _saliency_arguments(parser: argparse.ArgumentParser) -> None:
+    _model_arguments(parser)
+    parser.add_argument("-o", "--output", required=True, help="the picture: .png or .jpg")
+    parser.add_argument("--step", type=int, help="number of the frame (default: where the monotone quantity rises most)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episode (default 0)")
+
+
+def _saliency(args: argparse.Namespace) -> None:
+    from sb3_por.saliency import draw_saliency
+
+    model, vec_normalize = _load(args)
+    step = draw_saliency(model, args.env, args.output, args.step, args.seed, vec_normalize)
+    print(f"step {step}: {args.output}")
+
+
 def _suite_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", metavar="SUITE.yml", help="algos, envs, seeds, and what else a suite says")
     parser.add_argument("--root", default="runs", help="runs go to <root>/<suite>/<env>/<algo>/seed_<seed> (default runs)")
@@ -146,6 +180,18 @@ COMMANDS = {
         example="logs/sac_por logs/sac -o curve.png --csv scores.csv",
         add_arguments=_plot_arguments,
         run=_plot,
+    ),
+    "diagnose": Command(
+        help="measure what a model's classifier has learned: order, or which encoder it looks at",
+        example="--model logs/sac_por/PourWater-v0_1 --env PourWater-v0",
+        add_arguments=_diagnose_arguments,
+        run=_diagnose,
+    ),
+    "saliency": Command(
+        help="draw which pixels the classifier looks at",
+        example="--model logs/sac_por/PourWater-v0_1 --env PourWater-v0 -o map.png",
+        add_arguments=_saliency_arguments,
+        run=_saliency,
     ),
     "suite": Command(
         help="run what is left to do of a grid of algorithms, environments and seeds",

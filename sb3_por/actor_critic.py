@@ -178,25 +178,12 @@ class VisualActorCritic(ABC):
         :param batch_size: Transitions of this update
         """
         replay_data = self._sample(batch_size)
-        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
-        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         if self.use_sde:
             # log_std may have changed since the last update
             self.actor.reset_noise()
         views = self._make_views(replay_data)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
-
-        for name in self._next_names():
-            # All rows at once, before the objective asks for some of them
-            views.momentum(name)
-        objective_loss = self._objective_loss(views)
-
-        with th.no_grad():
-            next_values = [self._value_of(views, name, ent_coef) for name in self._next_names()]
-            target = self.reward_scale * replay_data.rewards
-            target = target + (1 - replay_data.dones) * discounts * sum(next_values) / len(next_values)
-        critic_losses = [self._critic_loss(views.online(name), replay_data.actions, target) for name in self._obs_names()]
-        critic_loss = sum(critic_losses) / len(critic_losses)
+        critic_loss, objective_loss = self._encoder_losses(replay_data, views, ent_coef)
 
         self._diagnose(replay_data, critic_loss, objective_loss)
         self.critic.optimizer.zero_grad()
@@ -211,6 +198,21 @@ class VisualActorCritic(ABC):
 
         self._metrics["ent_coef"].append(ent_coef.reshape(()))
         self._metrics["critic_loss"].append(critic_loss.detach())
+
+    def _encoder_losses(self, replay_data: Any, views: Views, ent_coef: th.Tensor) -> tuple[th.Tensor, th.Tensor | float]:
+        """L_RL and lambda * L_objective: the two losses that train the encoder."""
+        for name in self._next_names():
+            # All rows at once, before the objective asks for some of them
+            views.momentum(name)
+        objective_loss = self._objective_loss(views)
+        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        with th.no_grad():
+            next_values = [self._value_of(views, name, ent_coef) for name in self._next_names()]
+            target = self.reward_scale * replay_data.rewards
+            target = target + (1 - replay_data.dones) * discounts * sum(next_values) / len(next_values)
+        critic_losses = [self._critic_loss(views.online(name), replay_data.actions, target) for name in self._obs_names()]
+        return sum(critic_losses) / len(critic_losses), objective_loss
 
     def _sample(self, batch_size: int) -> Any:
         """A batch from the replay buffer with what the objective asks for."""
@@ -310,14 +312,25 @@ class VisualActorCritic(ABC):
         objective = self.policy.objective
         if objective is None or self._n_updates % self.diagnostics_interval != 0:
             return
-        parameters = self.critic.encoder_parameters()
-        for name, loss in (("critic", critic_loss), (objective.name, objective_loss)):
-            gradients = th.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
-            norms = [gradient.norm() for gradient in gradients if gradient is not None]
-            self._metrics[f"encoder_grad_norm_{name}"].append(th.stack(norms).norm() if norms else th.zeros(()))
-        frames = {"obs": self._prepare(replay_data.observations), "future": self._prepare(replay_data.observations)}
+        for name, norm in self._encoder_grad_norms(critic_loss, objective_loss).items():
+            self._metrics[f"encoder_grad_norm_{name}"].append(norm)
         with th.no_grad():
-            self._log_objective(objective.control(Views(self.critic, self.critic_target, frames)))
+            self._log_objective(objective.control(self._control_views(replay_data)))
+
+    def _encoder_grad_norms(self, critic_loss: th.Tensor, objective_loss: th.Tensor | float) -> dict[str, th.Tensor]:
+        """How hard each loss pulls at the encoder; keeps the graph."""
+        parameters = self.critic.encoder_parameters()
+        norms = {}
+        for name, loss in (("critic", critic_loss), (self.policy.objective.name, objective_loss)):
+            gradients = th.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
+            parts = [gradient.norm() for gradient in gradients if gradient is not None]
+            norms[name] = th.stack(parts).norm() if parts else th.zeros(())
+        return norms
+
+    def _control_views(self, replay_data: Any) -> Views:
+        """The observations twice, augmented independently: what an objective's control is shown."""
+        frames = {"obs": self._prepare(replay_data.observations), "future": self._prepare(replay_data.observations)}
+        return Views(self.critic, self.critic_target, frames)
 
     def _record_metrics(self) -> None:
         """Move the means since the last time to the logger: the one place that waits for the device."""

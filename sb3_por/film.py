@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
-import numpy as np
 from gymnasium.wrappers import RenderCollection
 
 from sb3_por.errors import UserError

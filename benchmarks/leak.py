@@ -57,13 +57,16 @@ class Record(BaseCallback):
     def __init__(self) -> None:
         super().__init__()
         self.rows: list[tuple[float, ...]] = []
+        self._since: list[list[float]] = []
 
     def _on_step(self) -> bool:
         updates = self.model._n_updates
-        if updates > 0 and updates % INTERVAL == 0:
-            values = {name: self.model._metrics.pop(name, []) for name in METRICS}
-            means = [float(np.mean([float(v) for v in values[name]])) if values[name] else np.nan for name in METRICS]
-            self.rows.append((updates, *means))
+        if updates > 0:
+            # The control is measured now and then; its last value stands until the next.
+            self._since.append([self.logger.name_to_value.get(f"train/{name}", np.nan) for name in METRICS])
+            if updates % INTERVAL == 0:
+                self.rows.append((updates, *np.nanmean(self._since, axis=0).tolist()))
+                self._since.clear()
         return True
 
 

@@ -1,0 +1,246 @@
+"""The shared training step: who trains the encoder, how often what is updated, what is logged."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.evaluation import evaluate_policy
+from toy_envs import DotEnv
+
+from sb3_por import SACPOR, VisualSAC
+
+POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
+
+
+def make_model(cls=VisualSAC, env=None, policy="CnnPolicy", n_collected=30, **kwargs):
+    defaults = dict(policy_kwargs=POLICY, buffer_size=200, learning_starts=1000, batch_size=8, seed=0, device="cpu")
+    return cls(policy, env or DotEnv(falling=True), **{**defaults, **kwargs}).learn(n_collected)
+
+
+def snapshot(parameters):
+    return [parameter.detach().clone() for parameter in parameters]
+
+
+def same(before, parameters):
+    return all(th.equal(old, new) for old, new in zip(before, parameters, strict=True))
+
+
+def test_actor_shares_the_critics_trunk_and_owns_its_projection():
+    policy = make_model().policy
+    assert policy.actor.features_extractor is policy.critic.features_extractor
+    assert policy.actor.projection is not policy.critic.projection
+    trained = {id(p) for group in policy.actor.optimizer.param_groups for p in group["params"]}
+    assert not trained & {id(p) for p in policy.critic.parameters()}
+    assert {id(p) for p in policy.actor.projection.parameters()} <= trained
+
+
+def test_unshared_actor_trains_a_trunk_of_its_own():
+    model = make_model(policy_kwargs=dict(POLICY, share_features_extractor=False))
+    assert model.actor.features_extractor is not model.critic.features_extractor
+    before = snapshot(model.actor.features_extractor.parameters())
+    model.train(1, 8)
+    assert not same(before, model.actor.features_extractor.parameters())
+
+
+def test_critic_loss_trains_the_encoder_and_actor_loss_leaves_no_gradient_there():
+    model = make_model()
+    views = model._make_views(model._sample(8))
+    critic_loss = model._critic_loss(views.online("obs"), views.data["actions"], th.zeros(8, 1))
+    critic_loss.backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.critic.encoder_parameters())
+    model.critic.optimizer.zero_grad()
+    before = snapshot(model.actor.own_parameters())
+    model._update_actor(views, th.ones(1))
+    assert all(p.grad is None for p in model.critic.parameters())
+    assert not same(before, model.actor.own_parameters())
+
+
+def test_momentum_encoder_gets_no_gradient_and_follows_equation_3_exactly():
+    model = make_model(SACPOR, encoder_tau=0.05, tau=0.01, target_update_interval=1)
+    for _ in range(3):
+        momentum, target_heads = snapshot(model.critic_target.encoder_parameters()), snapshot(
+            model.critic_target.head_parameters()
+        )
+        model.train(1, 8)
+        assert all(p.grad is None for p in model.critic_target.parameters())
+        for tau, old, new, online in (
+            (0.05, momentum, model.critic_target.encoder_parameters(), model.critic.encoder_parameters()),
+            (0.01, target_heads, model.critic_target.head_parameters(), model.critic.head_parameters()),
+        ):
+            for theta_m, updated, theta_o in zip(old, new, online, strict=True):
+                th.testing.assert_close(updated, tau * theta_o.detach() + (1 - tau) * theta_m, rtol=1e-6, atol=1e-8)
+
+
+def test_objective_and_critic_are_trained_by_one_loss_in_one_step():
+    model = make_model(SACPOR)
+    groups = model.critic.optimizer.param_groups
+    expected = [*model.critic.parameters(), *model.policy.objective.parameters()]
+    assert [id(p) for group in groups for p in group["params"]] == [id(p) for p in expected]
+    before = snapshot(expected)
+    model.train(1, 8)
+    assert all(not th.equal(old, new) for old, new in zip(before, expected, strict=True))
+
+
+def test_weight_0_trains_as_without_objective():
+    plain, weightless = make_model(n_collected=20), make_model(SACPOR, n_collected=20, por_coef=0.0)
+    for model in (plain, weightless):
+        model.encoder_tau, model.tau, model.actor_update_interval, model.target_update_interval = 0.05, 0.01, 2, 2
+        th.manual_seed(0)
+        np.random.seed(0)
+        model.train(4, 8)
+    for one, other in zip(plain.critic.parameters(), weightless.critic.parameters(), strict=True):
+        th.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+
+
+def test_intervals_count_over_the_whole_training():
+    model = make_model(actor_update_interval=3, target_update_interval=2)
+    changed = []
+    for _ in range(6):
+        actor, target = snapshot(model.actor.own_parameters()), snapshot(model.critic_target.parameters())
+        model.train(1, 8)
+        changed.append((not same(actor, model.actor.own_parameters()), not same(target, model.critic_target.parameters())))
+    assert changed == [(False, False), (False, True), (True, False), (False, True), (False, False), (True, True)]
+
+
+def count_encodings(model):
+    """Rows that pass each trunk in one update."""
+    rows = {}
+    for name, critic in (("online", model.critic), ("momentum", model.critic_target)):
+        rows[name] = []
+        critic.features_extractor.register_forward_hook(lambda _m, args, _o, name=name: rows[name].append(len(args[0])))
+    model.train(1, 8)
+    return {name: sum(counts) for name, counts in rows.items()}
+
+
+@pytest.mark.parametrize(
+    "cls, kwargs, expected",
+    [
+        # o_t and o_{t+1} online, o_{t+1} momentum
+        (VisualSAC, {}, dict(online=16, momentum=8)),
+        # The objective shares them all in the paper's pairing at k = 1
+        (SACPOR, dict(pairing="paper"), dict(online=16, momentum=8)),
+        # Half of the earlier frames pass f_m too
+        (SACPOR, dict(pairing="swap"), dict(online=16, momentum=12)),
+        (SACPOR, dict(pairing="paper", k=2), dict(online=16, momentum=16)),
+    ],
+)
+def test_each_frame_passes_each_encoder_once(cls, kwargs, expected):
+    assert count_encodings(make_model(cls, **kwargs)) == expected
+
+
+def test_reward_scale_scales_the_target():
+    model = make_model(reward_scale=3.0, gamma=0.0)
+    targets = []
+    critic_loss = model._critic_loss
+    model._critic_loss = lambda features, actions, target: targets.append(target) or critic_loss(features, actions, target)
+    np.random.seed(0)
+    model.train(1, 8)
+    np.random.seed(0)
+    th.testing.assert_close(targets[0], 3.0 * model._sample(8).rewards)
+
+
+def test_k_and_m_augmentations_are_averaged():
+    model = make_model(n_augmentations=2, n_target_augmentations=2, augmentation_pad=0)
+    assert count_encodings(model) == dict(online=32, momentum=16)
+    views = model._make_views(model._sample(4))
+    assert set(views.frames) == {"obs", "obs_1", "next", "next_1"}
+
+
+def test_frames_are_augmented_independently():
+    model = make_model(SACPOR, augmentation_pad=4)
+    frames = model._make_views(model._sample(64)).frames
+    assert frames["future"] is frames["next"]
+    th.manual_seed(0)
+    replay_data = model._sample(64)
+    first, second = model._prepare(replay_data.observations), model._prepare(replay_data.observations)
+    assert not th.equal(first, second)
+    assert first.dtype == th.float32 and first.max() <= 1.0
+
+
+def test_logs_objective_control_and_gradient_norms():
+    model = make_model(SACPOR, diagnostics_interval=2)
+    model.train(2, 8)
+    logged = model.logger.name_to_value
+    expected = {"por_loss", "por_accuracy", "por_leak_loss", "por_leak_accuracy", "critic_loss", "actor_loss", "ent_coef"}
+    expected |= {"ent_coef_loss", "n_updates", "encoder_grad_norm_critic", "encoder_grad_norm_por"}
+    assert {f"train/{name}" for name in expected} <= set(logged)
+    assert all(math.isfinite(logged[f"train/{name}"]) for name in expected)
+    assert logged["train/encoder_grad_norm_por"] > 0
+
+
+def test_diagnostics_do_not_change_the_gradient():
+    parameters = []
+    for interval in (1, 10_000):
+        model = make_model(SACPOR, diagnostics_interval=interval, augmentation_pad=0)
+        np.random.seed(0)
+        th.manual_seed(0)
+        model.train(1, 8)
+        parameters.append(snapshot(model.policy.parameters()))
+    assert same(*parameters)
+
+
+def test_k_needs_a_buffer_that_knows_episodes():
+    with pytest.raises(ValueError, match="ReplayBuffer cannot sample the later frames that SACPOR needs"):
+        make_model(SACPOR, k=3, replay_buffer_class=ReplayBuffer)
+    make_model(SACPOR, k=1, replay_buffer_class=ReplayBuffer).train(2, 8)
+
+
+@pytest.mark.parametrize(
+    "kwargs", [dict(k=3), dict(k=3, random_k=True), dict(n_steps=3), dict(pairing="paper", n_steps=2, k=2)]
+)
+def test_later_frames_and_n_step_returns_go_together(kwargs):
+    make_model(SACPOR, **kwargs).train(2, 8)
+
+
+@pytest.mark.parametrize("obs_type, policy", [("state", "MlpPolicy"), ("dict", "MultiInputPolicy")])
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_vectors_and_dicts(obs_type, policy, n_steps):
+    model = SACPOR(
+        policy,
+        DotEnv(obs_type=obs_type),
+        n_steps=n_steps,
+        buffer_size=100,
+        learning_starts=10,
+        policy_kwargs=dict(net_arch=[8]),
+    )
+    model.learn(25)
+    assert model._n_updates == 15
+
+
+def test_too_small_images_are_refused():
+    with pytest.raises(ValueError, match="16x16 pixels are too small for 3x3 convolutions with strides"):
+        VisualSAC("CnnPolicy", DotEnv(size=16), buffer_size=10)
+
+
+def test_networks_start_the_same_with_and_without_objective():
+    plain, por = make_model(n_collected=1), make_model(SACPOR, n_collected=1)
+    assert same(snapshot(plain.policy.critic.parameters()), por.policy.critic.parameters())
+    assert same(snapshot(plain.policy.actor.parameters()), por.policy.actor.parameters())
+
+
+def test_is_an_sb3_sac():
+    assert issubclass(SACPOR, SAC) and issubclass(VisualSAC, SAC)
+
+
+def test_learns_from_pixels():
+    env = DotEnv(falling=True)
+    model = SACPOR(
+        "CnnPolicy",
+        env,
+        learning_rate=1e-3,
+        buffer_size=2000,
+        learning_starts=100,
+        batch_size=16,
+        gamma=0.9,
+        ent_coef="auto_0.1",
+        augmentation_pad=1,
+        seed=0,
+        policy_kwargs=dict(net_arch=[32, 32], features_extractor_kwargs=dict(n_filters=8, strides=(2, 2, 2))),
+    )
+    before, _ = evaluate_policy(model, env, 10, warn=False)
+    model.learn(800)
+    after, _ = evaluate_policy(model, env, 10, warn=False)
+    assert after > 17 > before

@@ -32,7 +32,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
     :param render_size: height and width of what ``render`` returns, pixels
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 1 / CONTROL_PERIOD}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1 / CONTROL_PERIOD}  # noqa: RUF012
 
     #: What the images show.
     camera: ClassVar[Camera]
@@ -73,12 +73,16 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
 
         image = gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
         state = gym.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (len(self.state_names),), np.float32)
-        spaces = {"pixels": image, "state": state, "dict": gym.spaces.Dict({"image": image, "state": state})}
+        spaces: dict[str, gym.Space[Any]] = {
+            "pixels": image,
+            "state": state,
+            "dict": gym.spaces.Dict({"image": image, "state": state}),
+        }
         self.observation_space = spaces[obs_type]
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.action_size,), np.float32)
 
-        self.world: World | None = None
-        self.variation: int | None = None
+        self._world: World | None = None
+        self.variation = -1  # none before the first reset
         self._initial_performance = 0.0
 
     # -- what a task says ------------------------------------------------------------------------------------------
@@ -132,9 +136,9 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         else:
             split = SPLITS[self.split]
             self.variation = int(self.np_random.integers(split.start, split.stop))
-        if self.world is None:
-            self.world = World(self.steps_per_control, self.deformable)
-            self.renderer.attach(self.world)
+        if self._world is None:
+            self._world = World(self.steps_per_control, self.deformable)
+            self.renderer.attach(self._world)
         self.world.clear()
         self._build(self.world, variation_rng(type(self).__name__, self.variation))
         self._initial_performance = self.performance()
@@ -148,7 +152,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
 
         :raises ValueError: if the action has the wrong shape or is not finite; nothing has moved then
         """
-        if self.world is None:
+        if self._world is None:
             raise gym.error.ResetNeeded("call reset() before step()")
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.action_space.shape:
@@ -171,15 +175,24 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         if self.render_mode is None:
             gym.logger.warn('render() returns nothing: make the environment with render_mode="rgb_array"')
             return None
-        if self.world is None:
-            raise gym.error.ResetNeeded("call reset() before render()")
         return self._image(self.render_size)
 
     def close(self) -> None:
         """Free the Bullet client; ``reset`` opens a new one."""
-        if self.world is not None:
-            self.world.close()
-            self.world = None
+        if self._world is not None:
+            self._world.close()
+            self._world = None
+
+    @property
+    def world(self) -> World:
+        """
+        The Bullet world of the episode.
+
+        :raises gymnasium.error.ResetNeeded: before the first ``reset`` and after ``close``
+        """
+        if self._world is None:
+            raise gym.error.ResetNeeded("call reset() first")
+        return self._world
 
     # -- derived ---------------------------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import pybullet
 
 from softbody_envs.sim.world import World
@@ -20,7 +21,7 @@ class Ball:
         look = world.client.createVisualShape(pybullet.GEOM_SPHERE, radius=RADIUS, rgbaColor=COLOR)
         self._body = world.client.createMultiBody(0, -1, look, useMaximalCoordinates=True)
 
-    def move(self, position: Sequence[float]) -> None:
+    def move(self, position: Sequence[float] | np.ndarray) -> None:
         """
         :param position: of the centre, m
         """

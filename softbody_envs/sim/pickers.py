@@ -10,10 +10,11 @@ from softbody_envs.sim.world import GRAVITY, World
 #: Farthest that a picker moves along each axis in one control step, m, and the sub-steps it takes (SoftGym: 8 of 0.01 m).
 REACH = 0.08
 SUBSTEPS = 8
-#: A picker's body, kg. What it holds can slow it down: in a sub-step it is pushed by at most ``MASS * (LAG + move)``.
-MASS = 0.015
+#: A picker's body, kg. What it holds can hold it back: the force that brings it to the end of a sub-step of t seconds is at
+#: most ``MASS * (LAG + move) / t**2``, enough to lift a rope and too little to stretch it.
+MASS = 0.007
 #: How far a picker may fall behind where it was sent, m; it does not catch up on more.
-LAG = 0.008
+LAG = 0.018
 #: One colour a picker, and the shade it takes while it holds something.
 COLORS = ((0.85, 0.20, 0.15, 1.0), (0.15, 0.60, 0.20, 1.0))
 HOLDING_COLORS = ((0.40, 0.05, 0.03, 1.0), (0.02, 0.25, 0.05, 1.0))
@@ -134,8 +135,9 @@ class Pickers:
     def _send(self, move: np.ndarray) -> None:
         """Give the pickers the velocities that bring them, if nothing holds them back, to the end of a sub-step's move."""
         there = np.clip(self._sent + move, self._low, self._high)
-        if None not in self.held:
-            there = self._restrained(there, self._target.tether(*self.held))
+        first, second = self.held
+        if first is not None and second is not None:
+            there = self._restrained(there, self._target.tether(first, second))
         way = there - self.positions
         distance = np.sqrt((way**2).sum(axis=1, keepdims=True))
         longest = LAG + np.sqrt((move**2).sum(axis=1, keepdims=True))

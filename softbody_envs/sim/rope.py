@@ -16,7 +16,7 @@ RADIUS = 0.009
 #: Mass of a segment, kg.
 SEGMENT_MASS = 0.005
 #: Simulation steps in a control step: fewer, and fast pulls stretch the rope.
-STEPS_PER_CONTROL = 48
+STEPS_PER_CONTROL = 56
 #: SoftGym's rope colour, and that of the first and the last segment: in a heap an end looks like a bend.
 COLOR = (0.0, 0.5, 1.0, 1.0)
 END_COLOR = (1.0, 0.8, 0.0, 1.0)
@@ -41,7 +41,7 @@ class Rope:
         self._world = world
         client = world.client
         # Much damping, for a segment that spins fast leaves its joints in one step; stiff joints pull it back at once.
-        client.setPhysicsEngineParameter(numSolverIterations=15, erp=1.0)
+        client.setPhysicsEngineParameter(numSolverIterations=10, erp=1.0)
         shape = client.createCollisionShape(pybullet.GEOM_SPHERE, radius=RADIUS)
         look, end_look = (
             client.createVisualShape(pybullet.GEOM_CAPSULE, radius=RADIUS, length=SPACING, rgbaColor=color)

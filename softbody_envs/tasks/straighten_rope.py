@@ -44,9 +44,9 @@ class StraightenRopeEnv(SoftbodyEnv):
     | 7 | pick | as 3 |
 
     x points right in the image, y up, z toward the camera. The centres of the pickers stay within x, y = -0.28 to 0.28 m and
-    z = 0.02 to 0.20 m. A picker keeps the offset at which it took a node. It pushes with about 2 N at most: when the rope
-    cannot follow it stays behind, and two pickers that hold the rope cannot be sent farther apart than the rope between
-    them is long.
+    z = 0.02 to 0.20 m. A picker keeps the offset at which it took a node. It pulls with 2.5 N at most (the rope weighs 1 N):
+    when the rope cannot follow it stays behind. Two pickers that hold the rope cannot be sent farther apart than the rope
+    between them is long.
 
     ## Observation Space
 

@@ -304,6 +304,8 @@ class VisualActorCritic(ABC):
         encoder_tau = self.tau if self.encoder_tau is None else self.encoder_tau
         polyak_update(self.critic.encoder_parameters(), self.critic_target.encoder_parameters(), encoder_tau)
         polyak_update(self.critic.head_parameters(), self.critic_target.head_parameters(), self.tau)
+        if self.policy.objective is not None:
+            self.policy.objective.update_momentum(encoder_tau)
         # Copy running stats, see SB3 #996
         polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 

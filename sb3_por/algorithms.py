@@ -2,9 +2,10 @@
 
 from typing import Any
 
-from sb3_por.objectives.base import Objective
-from sb3_por.objectives.por import PartialOrder
+from sb3_por.actor_critic import VisualActorCritic
+from sb3_por.objectives import Contrastive, Objective, PartialOrder, SelfPredictive
 from sb3_por.visual_sac import VisualSAC
+from sb3_por.visual_tqc import VisualTQC
 
 
 class ReferenceSettings:
@@ -92,6 +93,84 @@ class SACPOR(WithPartialOrder, VisualSAC):
     """
 
 
-ALGORITHMS: dict[str, type[VisualSAC]] = {
+class TQCPOR(WithPartialOrder, VisualTQC):
+    """
+    TQC from pixels with a partial-order representation (POR). Arguments: those of ``VisualTQC``, and those of
+    ``WithPartialOrder`` by keyword.
+    """
+
+
+class SACDrQ(ReferenceSettings, VisualSAC):
+    """
+    DrQ (https://arxiv.org/abs/2004.13649): SAC from pixels with [K, M] random shifts and nothing else. Losses are
+    averaged over the M augmentations; DrQ sums them, which Adam does not notice. Arguments: those of ``VisualSAC``.
+
+    :param n_augmentations: DrQ's M
+    :param n_target_augmentations: DrQ's K
+    :param encoder_tau: That of the Q networks by default: DrQ has one for all
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        n_augmentations: int = 2,
+        n_target_augmentations: int = 2,
+        encoder_tau: float | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            *args,
+            n_augmentations=n_augmentations,
+            n_target_augmentations=n_target_augmentations,
+            encoder_tau=encoder_tau,
+            **kwargs,
+        )
+
+
+class SACCURL(ReferenceSettings, VisualSAC):
+    """
+    CURL: SAC from pixels with a contrastive objective. Arguments: those of ``VisualSAC`` and
+
+    :param curl_coef: Weight of the contrastive loss
+    """
+
+    def __init__(self, *args: Any, curl_coef: float = 1.0, **kwargs: Any):
+        self.curl_coef = curl_coef
+        super().__init__(*args, **kwargs)
+
+    def _objective(self) -> tuple[type[Objective], dict[str, Any]]:
+        return Contrastive, {}
+
+    @property
+    def objective_coef(self) -> float:
+        return self.curl_coef
+
+
+class SACSPR(ReferenceSettings, VisualSAC):
+    """
+    SPR: SAC from pixels with a self-predictive objective. Arguments: those of ``VisualSAC`` and
+
+    :param spr_coef: Weight of the loss, which is summed over the steps
+    :param horizon: Number K of steps to predict
+    """
+
+    def __init__(self, *args: Any, spr_coef: float = 1.0, horizon: int = 5, **kwargs: Any):
+        self.spr_coef = spr_coef
+        self.horizon = horizon
+        super().__init__(*args, **kwargs)
+
+    def _objective(self) -> tuple[type[Objective], dict[str, Any]]:
+        return SelfPredictive, dict(horizon=self.horizon)
+
+    @property
+    def objective_coef(self) -> float:
+        return self.spr_coef
+
+
+ALGORITHMS: dict[str, type[VisualActorCritic]] = {
     "sac_por": SACPOR,
+    "sac_drq": SACDrQ,
+    "sac_curl": SACCURL,
+    "sac_spr": SACSPR,
+    "tqc_por": TQCPOR,
 }

@@ -211,7 +211,9 @@ class VisualPolicy:
             )
 
         # One optimizer for one summed loss: L = lambda * L_objective + L_RL
-        trained_with_critic = [*self.critic.parameters(), *(self.objective.parameters() if self.objective else [])]
+        trained_with_critic = list(self.critic.parameters())
+        if self.objective is not None:
+            trained_with_critic += [parameter for parameter in self.objective.parameters() if parameter.requires_grad]
         for network, parameters in ((self.critic, trained_with_critic), (self.actor, self.actor.own_parameters())):
             network.optimizer = self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)
 

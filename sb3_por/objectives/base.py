@@ -48,6 +48,13 @@ class Objective(nn.Module, ABC):
         """
         return {}
 
+    def update_momentum(self, tau: float) -> None:
+        """
+        Update networks of the objective that are moving averages; called together with the momentum encoder's update.
+
+        :param tau: Soft update coefficient of the momentum encoder
+        """
+
 
 def mlp(in_dim: int, hidden_dim: int, out_dim: int) -> nn.Sequential:
     """

@@ -26,8 +26,8 @@ DEMO := demo/$(shell date +%Y%m%d-%H%M%S)
 DEMO_RUN := $(DEMO)/sac_por/PourWater-v0_1
 
 demo: $(VENV)/.installed-test
-	$(BIN)/python train.py --algo sac_por --env PourWater-v0 --seed 1 -n 4000 --eval-freq 1000 --eval-episodes 5 \
-		-f $(DEMO) -params learning_starts:500 buffer_size:4000 $(ARGS)
+	$(BIN)/python train.py --algo sac_por --env PourWater-v0 --seed 1 -n 3000 --eval-freq 1000 --eval-episodes 5 \
+		-f $(DEMO) -params learning_starts:500 buffer_size:3000 $(ARGS)
 	$(BIN)/python -m sb3_por evaluate --model $(DEMO_RUN)/best_model.zip --env PourWater-v0 -n 10
 	$(BIN)/python -m sb3_por plot $(DEMO_RUN) -o $(DEMO)/curve.png
 	$(BIN)/python -m sb3_por enjoy --model $(DEMO_RUN)/best_model.zip --env PourWater-v0 -o $(DEMO)/pour_water.gif

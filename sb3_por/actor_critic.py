@@ -12,12 +12,14 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.augmentations import RandomShift
 from sb3_por.memory import keep_freed_memory
 from sb3_por.objectives.base import Objective
+from sb3_por.overlap import OverlappedEnv
 from sb3_por.replay import SequenceReplayBuffer
 from sb3_por.rng import get_rng_state, set_rng_state
 from sb3_por.views import Views
@@ -41,6 +43,9 @@ class VisualActorCritic(ABC):
     :param n_augmentations: DrQ's M: augmentations of o_t whose critic losses are averaged
     :param n_target_augmentations: DrQ's K: augmentations of o_{t+1} whose targets are averaged
     :param diagnostics_interval: Log the objective's control and the losses' gradient norms every that many updates
+    :param overlap: Train while the environments make the next step, which pays with worker processes
+        (``SubprocVecEnv``). Updates that are due after a rollout are made in the first step of the next one, always
+        between sending the actions and waiting for the results, so that runs stay reproducible
     """
 
     def __init__(
@@ -60,6 +65,7 @@ class VisualActorCritic(ABC):
         n_augmentations: int = 1,
         n_target_augmentations: int = 1,
         diagnostics_interval: int = 200,
+        overlap: bool = False,
         **kwargs: Any,
     ):
         self.encoder_tau = encoder_tau
@@ -69,6 +75,8 @@ class VisualActorCritic(ABC):
         self.n_augmentations = n_augmentations
         self.n_target_augmentations = n_target_augmentations
         self.diagnostics_interval = diagnostics_interval
+        self.overlap = overlap
+        self._defer, self._updates_due = False, 0
         self.rng_state: dict[str, Any] | None = None
         self._metrics: dict[str, list[th.Tensor]] = defaultdict(list)
         kwargs["target_update_interval"] = target_update_interval
@@ -158,6 +166,9 @@ class VisualActorCritic(ABC):
         :param gradient_steps: Number of updates
         :param batch_size: Transitions per update
         """
+        if self._defer:
+            self._defer, self._updates_due = False, self._updates_due + gradient_steps
+            return
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
@@ -344,6 +355,23 @@ class VisualActorCritic(ABC):
         self._record_metrics()
         super().dump_logs()
 
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """See SB3. With ``overlap`` the updates that the last rollout left are made in the first step of this one."""
+        if not self.overlap:
+            return super().collect_rollouts(env, *args, **kwargs)
+        rollout = super().collect_rollouts(OverlappedEnv(env, self._train_due), *args, **kwargs)
+        # The updates that SB3 asks for next
+        self._defer = True
+        return rollout
+
+    def _train_due(self) -> None:
+        """Make the updates that are due; the policy goes on acting in evaluation mode."""
+        self._defer = False
+        if self._updates_due > 0:
+            updates, self._updates_due = self._updates_due, 0
+            self.train(updates, self.batch_size)
+            self.policy.set_training_mode(False)
+
     def learn(
         self,
         total_timesteps: int,
@@ -363,7 +391,9 @@ class VisualActorCritic(ABC):
         :return: The model
         """
         name = type(self).__name__ if tb_log_name is None else tb_log_name
-        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+        super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+        self._train_due()
+        return self
 
     def _setup_learn(
         self,

@@ -53,6 +53,7 @@ class VisualSAC(VisualActorCritic, SAC):
     :param n_augmentations: Augmentations of each observation, whose critic losses are averaged (DrQ's M)
     :param n_target_augmentations: Augmentations of each next observation, whose targets are averaged (DrQ's K)
     :param diagnostics_interval: Log the objective's control and the losses' gradient norms every that many updates
+    :param overlap: Train while the environments make the next step; pays with worker processes (``SubprocVecEnv``)
     :param _init_setup_model: Whether to build the networks at the creation of the instance
     """
 

@@ -176,6 +176,7 @@ def test_weights_of_the_objectives_can_be_set(cls):
 
 
 @pytest.mark.parametrize("name", [name for name in ALGORITHMS if name != "sac_por"])
+@pytest.mark.timeout(900)
 def test_every_algorithm_improves_from_pixels(name):
     env = DotEnv(size=20, falling=True)
     kwargs = dict(horizon=2) if name == "sac_spr" else {}
@@ -192,7 +193,7 @@ def test_every_algorithm_improves_from_pixels(name):
         policy_kwargs=dict(net_arch=[32, 32], features_extractor_kwargs=dict(n_filters=8, strides=(2, 2))),
         **kwargs,
     )
-    before, _ = evaluate_policy(model, env, 10, warn=False)
     model.learn(700)
     after, _ = evaluate_policy(model, env, 10, warn=False)
-    assert after > max(16, before + 3)
+    # Of 20; staying where the episode begins, as at random, gives 10 on average
+    assert after > 16.5

@@ -121,7 +121,7 @@ def test_runs_started_together_get_folders_of_their_own(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--algo", "sac_pro"], "unknown algorithm 'sac_pro'; did you mean sac_por?"),
+        (["--algo", "sac_poor"], "unknown algorithm 'sac_poor'; did you mean sac_por?"),
         (["--env", "pourwater-v0"], "unknown environment 'pourwater-v0'; did you mean PourWater-v0?"),
         (["--nonsense"], "unrecognized arguments: --nonsense"),
         (["--algo", "sac", "--env", "CartPole-v1"], "action spaces but Discrete(2) was provided"),

@@ -52,7 +52,8 @@ def paint_sheet(
 
     farthest_first = np.flatnonzero(shown)[np.argsort(-distance[shown], kind="stable")]
     is_face, normals = is_face[farthest_first], normals[farthest_first]
-    facing_light = (normals @ LIGHT) * np.where(is_face, 1, -1) / np.linalg.norm(normals, axis=1)
+    lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)  # of a crease
+    facing_light = (normals @ LIGHT) * np.where(is_face, 1, -1) / lengths
     brightness = AMBIENT + (1 - AMBIENT) * np.clip(facing_light, 0, 1)
     colors = np.where(is_face[:, None], face, underside) * brightness[:, None]
     frame.reshape(-1, 3)[pixel[farthest_first]] = np.round(255 * colors)

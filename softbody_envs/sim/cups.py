@@ -112,26 +112,29 @@ class Cup:
         return (x <= half[0]) & (y <= half[1]) & (z <= half[2])
 
 
-def corners(size: CupSize, x: float, z: float, angle: float) -> np.ndarray:
+def corners(size: CupSize, x: np.ndarray | float, z: np.ndarray | float, angle: np.ndarray | float) -> np.ndarray:
     """
-    The outer rectangle of a cup in the x-z plane.
+    The outer rectangle of a cup in the x-z plane, for one pose or for arrays of them.
 
-    :return: m, ``(4, 2)``, in the order of the outline
+    :return: m, ``(..., 4, 2)``, in the order of the outline
     """
     half, top = size.outer_length / 2, size.outer_height
-    outline = np.array([(-half, 0.0), (half, 0.0), (half, top), (-half, top)])
+    along, up = np.array([(-half, 0.0), (half, 0.0), (half, top), (-half, top)]).T
+    x, z, angle = (np.asarray(number)[..., None] for number in (x, z, angle))
     cos, sin = np.cos(angle), np.sin(angle)
-    return outline @ np.array([(cos, -sin), (sin, cos)]) + (x, z)
+    return np.stack([x + cos * along + sin * up, z - sin * along + cos * up], axis=-1)
 
 
-def overlap(first: np.ndarray, second: np.ndarray) -> bool:
+def overlap(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """
-    Whether two convex outlines touch (separating-axis test).
+    Whether convex outlines touch (separating-axis test).
 
-    :param first: ``(n, 2)``
+    :param first: ``(..., n, 2)``
     :param second: ``(m, 2)``
+    :return: bool ``(...)``
     """
-    edges = np.concatenate([np.roll(outline, -1, axis=0) - outline for outline in (first, second)])
-    normals = edges[:, ::-1] * (1.0, -1.0)
-    a, b = first @ normals.T, second @ normals.T
-    return bool(((a.max(axis=0) >= b.min(axis=0)) & (b.max(axis=0) >= a.min(axis=0))).all())
+    second = np.broadcast_to(second, (*first.shape[:-2], *second.shape))
+    edges = np.concatenate([np.roll(outline, -1, axis=-2) - outline for outline in (first, second)], axis=-2)
+    normals = (edges[..., ::-1] * (1.0, -1.0)).swapaxes(-1, -2)
+    a, b = first @ normals, second @ normals
+    return ((a.max(axis=-2) >= b.min(axis=-2)) & (b.max(axis=-2) >= a.min(axis=-2))).all(axis=-1)

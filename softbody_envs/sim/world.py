@@ -1,6 +1,6 @@
-"""One Bullet world: the client, its settings, and the rigid boxes that scenes are built of."""
+"""One Bullet world: the client, its settings, and its floor."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import pybullet
 from pybullet_utils.bullet_client import BulletClient
@@ -10,6 +10,19 @@ from softbody_envs.sim.quiet import quiet
 #: One control step: what an action lasts, s (SoftGym: 8 steps of 0.01 s).
 CONTROL_PERIOD = 0.08
 GRAVITY = -9.8
+
+
+@dataclass(frozen=True)
+class Floor:
+    """
+    A horizontal square about the z axis. Bullet has it as a body that nothing draws: `Renderer` does.
+
+    :param height: m
+    :param half_size: how far it is seen to reach, m; as a plane it collides beyond that
+    """
+
+    height: float
+    half_size: float
 
 
 class World:
@@ -24,12 +37,15 @@ class World:
         self.steps_per_control = steps_per_control
         self.time_step = CONTROL_PERIOD / steps_per_control
         self.deformable = deformable
+        #: What the scene stands on, if anything.
+        self.floor: Floor | None = None
         with quiet():
             self.client = BulletClient(pybullet.DIRECT)
 
     def clear(self) -> None:
         """Remove every body and set all settings again: ``resetSimulation`` forgets some of them and keeps others."""
         self.client.resetSimulation(pybullet.RESET_USE_DEFORMABLE_WORLD if self.deformable else 0)
+        self.floor = None
         self.client.setGravity(0.0, 0.0, GRAVITY)
         # File caching would serve an old mesh under a reused name (bullet#2277).
         self.client.setPhysicsEngineParameter(
@@ -45,32 +61,25 @@ class World:
         if self.client._client >= 0 and self.client.isConnected():
             self.client.disconnect()
 
-    def add_floor(self, height: float = 0.0, half_size: float = 3.0, color: Sequence[float] = (0.85, 0.85, 0.85, 1.0)) -> int:
+    def add_floor(self, height: float = 0.0) -> None:
         """
-        An infinite half-space that nothing can tunnel through, drawn as a slab. Rigid worlds only: cloth needs a box.
+        An infinite half-space that nothing can tunnel through. Rigid worlds only: cloth needs a box.
 
         :param height: of the surface, m
-        :return: the body's id
         """
-        slab = self.client.createVisualShape(
-            pybullet.GEOM_BOX, halfExtents=(half_size, half_size, 0.01), rgbaColor=color, visualFramePosition=(0, 0, -0.01)
-        )
         plane = self.client.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=(0, 0, 1))
-        return self.client.createMultiBody(0, plane, slab, basePosition=(0, 0, height))
+        self._hide(self.client.createMultiBody(0, plane, basePosition=(0, 0, height)))
+        self.floor = Floor(height, half_size=3.0)
 
-    def add_box_floor(self, half_size: float = 5.0, color: Sequence[float] = (0.85, 0.85, 0.85, 1.0)) -> int:
-        """
-        A thick slab with its top at z = 0, for deformable worlds: on a plane a cloth never settles.
-
-        :return: the body's id
-        """
-        half_extents = (half_size, half_size, 0.5)
-        body = self.client.createMultiBody(
-            0,
-            self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half_extents),
-            self.client.createVisualShape(pybullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=color),
-            basePosition=(0, 0, -0.5),
-            useMaximalCoordinates=True,  # a sixth cheaper under a cloth
-        )
+    def add_box_floor(self) -> None:
+        """A thick slab with its top at z = 0, for deformable worlds: on a plane a cloth never settles."""
+        self.floor = Floor(0.0, half_size=5.0)
+        box = self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=(self.floor.half_size, self.floor.half_size, 0.5))
+        # Maximal coordinates are a sixth cheaper under a cloth.
+        body = self.client.createMultiBody(0, box, basePosition=(0, 0, -0.5), useMaximalCoordinates=True)
         self.client.changeDynamics(body, -1, lateralFriction=1.0)
-        return body
+        self._hide(body)
+
+    def _hide(self, body: int) -> None:
+        """A body without a visual shape would be drawn as it collides."""
+        self.client.changeVisualShape(body, -1, rgbaColor=(0, 0, 0, 0))

@@ -152,18 +152,25 @@ class PourWaterEnv(SoftbodyEnv):
         self._locate()
 
     def _control(self, action: np.ndarray) -> None:
-        change = action * REACH / self.steps_per_control
-        for _ in range(self.steps_per_control):
-            here = np.array([self.cup.x, self.cup.z, self.cup.angle])
-            there = np.clip(here + change, self._low, self._high)
-            self.cup.move(*(there if self._allowed(there) else here))
+        pose = np.array([self.cup.x, self.cup.z, self.cup.angle])
+        part = np.arange(1, self.steps_per_control + 1)[:, None] / self.steps_per_control
+        way = np.clip(pose + part * action * REACH, self._low, self._high)
+        # A move that is refused is refused again in every step that remains.
+        for there, allowed in zip(way, np.logical_and.accumulate(self._allowed(way)), strict=True):
+            pose = there if allowed else pose
+            self.cup.move(*pose)
             self.world.step()
         self._locate()
 
-    def _allowed(self, pose: np.ndarray) -> bool:
-        """SoftGym refuses a move as a whole if a corner would sink below the table or the cup would touch the target."""
-        outline = corners(self.cup.size, *pose)
-        return bool(outline[:, 1].min() >= -1e-9) and not overlap(outline, self._forbidden)
+    def _allowed(self, poses: np.ndarray) -> np.ndarray:
+        """
+        SoftGym refuses a move as a whole if a corner would sink below the table or the cup would touch the target.
+
+        :param poses: x and z of the underside's middle, m, and tilt, rad, ``(..., 3)``
+        :return: bool ``(...)``
+        """
+        outlines = corners(self.cup.size, *np.moveaxis(poses, -1, 0))
+        return (outlines[..., 1].min(axis=-1) >= -1e-9) & ~overlap(outlines, self._forbidden)
 
     def _locate(self) -> None:
         """Find out where each particle is; between control steps nothing moves."""

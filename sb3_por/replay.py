@@ -25,6 +25,9 @@ class SequenceSamples(NamedTuple):
     :param discounts: gamma ** n, ``(batch, 1)``; None for n = 1
     :param future_observations: o_{t+k}; None if not asked for
     :param gaps: k of each sample, ``(batch,)``; smaller than asked for where the episode ended earlier
+    :param past_observations: o_{t-k}; None if not asked for
+    :param past_gaps: k of each sample, ``(batch,)``; smaller than asked for where the episode began later, 0 for its first
+        frame
     :param window_observations: o_{t+1} .. o_{t+K}, ``(batch, K, ...)``; None if not asked for
     :param window_actions: a_t .. a_{t+K-1}, ``(batch, K, action_dim)``
     :param window_mask: 1 where a step of the window belongs to the episode, ``(batch, K)``; the others repeat the last
@@ -38,6 +41,8 @@ class SequenceSamples(NamedTuple):
     discounts: th.Tensor | None = None
     future_observations: Observations | None = None
     gaps: th.Tensor | None = None
+    past_observations: Observations | None = None
+    past_gaps: th.Tensor | None = None
     window_observations: Observations | None = None
     window_actions: th.Tensor | None = None
     window_mask: th.Tensor | None = None
@@ -121,8 +126,8 @@ class SequenceReplayBuffer(NStepReplayBuffer):
     100 000 frames of 84x84 pixels take 2.1 GB; the frame after the last action of an episode is kept too, so that
     time limits bootstrap from the right frame (SB3's ``optimize_memory_usage`` cannot do that, SB3 #934).
 
-    Samples are transitions (with n-step returns if ``n_steps > 1``) and, on request, the frame k steps later and the
-    window of the next K steps. Neither crosses the end of an episode, a reset or the write head.
+    Samples are transitions (with n-step returns if ``n_steps > 1``) and, on request, the frames k steps later and k steps
+    earlier and the window of the next K steps. None crosses the end of an episode, a reset or the write head.
     Indices are drawn from numpy's global generator, as in SB3.
 
     :param buffer_size: Number of transitions, of all environments together
@@ -292,11 +297,19 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         is_last = self.ended[steps, envs[:, None]] | (steps == (self.pos - 1) % self.buffer_size)
         return np.where(is_last.any(axis=1), is_last.argmax(axis=1) + 1, max_steps)
 
+    def _steps_before(self, slots: np.ndarray, envs: np.ndarray, max_steps: int) -> np.ndarray:
+        """Number of stored steps from the start of its episode or the oldest slot to each slot, at most ``max_steps``."""
+        steps = (slots[:, None] - np.arange(max_steps)) % self.buffer_size
+        oldest = self.pos if self.full else 0
+        is_first = self.ended[steps - 1, envs[:, None]] | (steps == oldest)
+        return np.where(is_first.any(axis=1), is_first.argmax(axis=1), max_steps)
+
     def sample(  # type: ignore[override]
         self,
         batch_size: int,
         env: VecNormalize | None = None,
         future: tuple[int, int] | None = None,
+        past: tuple[int, int] | None = None,
         window: int = 0,
     ) -> SequenceSamples:
         """
@@ -304,19 +317,28 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         :param env: Associated VecNormalize, to normalize observations and rewards
         :param future: Also sample the frame k steps later, with k drawn uniformly from this closed range; the last
             frame of the episode where it ends earlier
+        :param past: Also sample the frame k steps earlier; the first frame of the episode where it begins later
         :param window: Also sample this number of following frames and the actions before each of them
         :return: The samples, on ``device``
         """
         slots = np.random.randint(0, self.size(), size=batch_size)
         envs = np.random.randint(0, self.n_envs, size=batch_size)
-        gaps = None if future is None else np.random.randint(future[0], future[1] + 1, size=batch_size)
-        return self._samples(slots, envs, gaps, window, env)
+        gaps, past_gaps = (
+            None if limits is None else np.random.randint(limits[0], limits[1] + 1, size=batch_size) for limits in (future, past)
+        )
+        return self._samples(slots, envs, gaps, past_gaps, window, env)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> SequenceSamples:  # type: ignore[override]
-        return self._samples(batch_inds, np.random.randint(0, self.n_envs, size=len(batch_inds)), None, 0, env)
+        return self._samples(batch_inds, np.random.randint(0, self.n_envs, size=len(batch_inds)), None, None, 0, env)
 
     def _samples(
-        self, slots: np.ndarray, envs: np.ndarray, gaps: np.ndarray | None, window: int, env: VecNormalize | None
+        self,
+        slots: np.ndarray,
+        envs: np.ndarray,
+        gaps: np.ndarray | None,
+        past_gaps: np.ndarray | None,
+        window: int,
+        env: VecNormalize | None,
     ) -> SequenceSamples:
         steps_left = self._steps_left(slots, envs, self.n_steps)
         last_slots = (slots + steps_left - 1) % self.buffer_size
@@ -327,6 +349,10 @@ class SequenceReplayBuffer(NStepReplayBuffer):
             gaps = np.minimum(gaps, self._steps_left(slots, envs, int(gaps.max())))
             future_rows = self._next_rows((slots + gaps - 1) % self.buffer_size, envs)
             extra.update(future_observations=self._gather(future_rows, env), gaps=self.to_torch(gaps, copy=False))
+        if past_gaps is not None:
+            past_gaps = np.minimum(past_gaps, self._steps_before(slots, envs, int(past_gaps.max())))
+            past_rows = (slots - past_gaps) % self.buffer_size * self.n_envs + envs
+            extra.update(past_observations=self._gather(past_rows, env), past_gaps=self.to_torch(past_gaps, copy=False))
         if window > 0:
             extra.update(self._window(slots, envs, window, env))
         return SequenceSamples(

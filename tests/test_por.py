@@ -110,6 +110,19 @@ def test_swap_pairing_swaps_the_encoders_and_keeps_the_times_in_half_of_the_batc
     th.testing.assert_close(s_tk, th.cat([online["future"][:4], momentum["future"][4:]]))
 
 
+def test_swap_pairing_takes_earlier_frames_in_half_of_the_batch_where_there_are_some(views):
+    views.frames["past"] = th.randn(4, 3)
+    views.data["past_gaps"] = th.tensor([1, 1, 0, 1])
+    s_t, s_tk = PartialOrder(FEATURES_DIM, 1, pairing="swap").pairs(views)
+    online = views.critic.projection(views.critic.trunk(views.frames["obs"]))
+    future, past = (
+        views.critic_target.projection(views.critic_target.trunk(views.frames[name])) for name in ("future", "past")
+    )
+    # Pair 2 is the first of its episode
+    th.testing.assert_close(s_t, th.cat([past[:2], online[2:3], past[3:], online[4:]]))
+    th.testing.assert_close(s_tk, th.cat([online[:2], future[2:3], online[3:4], future[4:]]))
+
+
 @pytest.mark.parametrize("order_head", ["mlp", "difference", "coordinatewise"])
 def test_learns_an_order_and_a_potential_that_follows_it(order_head):
     th.manual_seed(0)

@@ -91,8 +91,11 @@ def fill(buffer, space, n_steps, seed=0, interrupt=False):
 
 def check(buffer, naive, batch_size=400, k=(1, 5), window=5):
     """Every sample of a large batch must be what the naive list says."""
-    samples = buffer.sample(batch_size, future=k, window=window)
+    samples = buffer.sample(batch_size, future=k, past=k, window=window)
     where = {naive.episodes[e]["frames"][t]: (e, t) for steps in naive.steps for e, t in steps}
+    first_stored = {}
+    for e, t in where.values():
+        first_stored[e] = min(t, first_stored.get(e, t))
     seen = set()
     for i, frame in enumerate(decode(samples.observations)):
         episode, t = where[frame]
@@ -110,6 +113,9 @@ def check(buffer, naive, batch_size=400, k=(1, 5), window=5):
         gap = samples.gaps[i].item()
         assert gap == left if gap < k[0] else gap <= min(k[1], left)
         assert decode(samples.future_observations)[i] == record["frames"][t + gap]
+        gap, stored_before = samples.past_gaps[i].item(), t - first_stored[episode]
+        assert gap == stored_before if gap < k[0] else gap <= min(k[1], stored_before)
+        assert decode(samples.past_observations)[i] == record["frames"][t - gap]
         m = min(window, left)
         assert samples.window_mask[i].tolist() == [1.0] * m + [0.0] * (window - m)
         assert decode(samples.window_observations)[i, :m].tolist() == record["frames"][t + 1 : t + m + 1]

@@ -85,7 +85,7 @@ def test_objective_and_critic_are_trained_by_one_loss_in_one_step():
 
 
 def test_weight_0_trains_as_without_objective():
-    plain, weightless = make_model(n_collected=20), make_model(SACPOR, n_collected=20, por_coef=0.0)
+    plain, weightless = make_model(n_collected=20), make_model(SACPOR, n_collected=20, por_coef=0.0, pairing="paper")
     for model in (plain, weightless):
         model.encoder_tau, model.tau, model.actor_update_interval, model.target_update_interval = 0.05, 0.01, 2, 2
         th.manual_seed(0)

@@ -21,6 +21,9 @@ class Objective(nn.Module, ABC):
     name: str
     #: Range of k if the objective needs ``"future"``, the frame k steps later
     future: tuple[int, int] | None = None
+    #: Range of k if the objective wants ``"past"``, for the first half of the batch the frame k steps earlier, and
+    #: ``"past_gaps"``, these k; a replay buffer that has no such frames gives neither
+    past: tuple[int, int] | None = None
     #: Length K of ``"window"``, the next K frames with their actions; 0 if the objective does not need it
     window: int = 0
     #: Whether the objective needs ``"positive"``, another augmentation of the observation
@@ -43,7 +46,7 @@ class Objective(nn.Module, ABC):
         Measure what the objective could do without the structure that it is meant to find. Called now and then,
         without gradient.
 
-        :param views: The same frame, augmented twice, as ``"obs"`` and ``"future"``
+        :param views: The same frame, augmented independently, as ``"obs"``, ``"future"`` and ``"past"``
         :return: Scalars to log; none if the objective has no such control
         """
         return {}

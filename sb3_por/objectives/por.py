@@ -100,7 +100,9 @@ class PartialOrder(Objective):
 
     In that pairing the online encoder always has the earlier frame, and c can tell the encoders apart instead of the
     times. ``pairing="swap"`` gives the online encoder the later frame in one half of the batch (the batch is i.i.d., so
-    that a fixed half is a random half); labels follow time.
+    that a fixed half is a random half); labels follow time. There the pair of o_t is o_{t-k} instead of o_{t+k}, so that
+    the online encoder has to encode no frames but those of the critic. Where o_t is the first of its episode its pair
+    stays o_{t+k}; where the replay buffer cannot go back the encoders are swapped, (f_m(o_t), f_o(o_{t+k})).
 
     :param features_dim: Size n of the encoder's features
     :param action_dim: Size of an action
@@ -139,6 +141,7 @@ class PartialOrder(Objective):
             raise ValueError(f"k must be at least 1, not {k}.")
         self.pairing = pairing
         self.future = (1 if random_k else k, k)
+        self.past = self.future if pairing == "swap" else None
         self.g = mlp(features_dim, hidden_dim, order_dim)
         self.c = ORDER_HEADS[order_head](order_dim, hidden_dim)
 
@@ -158,12 +161,18 @@ class PartialOrder(Objective):
 
     def pairs(self, views: Views) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param views: The frames of the batch, among them ``"obs"`` and ``"future"``
+        :param views: The frames of the batch, among them ``"obs"``, ``"future"`` and, if there are such, ``"past"``
         :return: Features of the earlier and of the later frame of each pair, shape ``(batch, n)`` each
         """
         if self.pairing == "paper":
             return views.online("obs"), views.momentum("future")
         half = views.batch_size // 2
+        if "past" in views.frames:
+            past, present, future = views.momentum("past"), views.online("obs"), views.momentum("future")
+            has_past = views.data["past_gaps"][:, None] > 0
+            s_t = th.cat([th.where(has_past, past, present[:half]), present[half:]])
+            s_tk = th.cat([th.where(has_past, present[:half], future[:half]), future[half:]])
+            return s_t, s_tk
         s_t = th.cat([views.momentum("obs", slice(half)), views.online("obs")[half:]])
         s_tk = th.cat([views.online("future", half), views.momentum("future", slice(half, None))])
         return s_t, s_tk
@@ -173,7 +182,7 @@ class PartialOrder(Objective):
         The leak control: the loss and the accuracy on pairs with k = 0. There is no order in one frame, so that both
         must stay at chance (ln 2 per term and 1/2); where they do not, the classifier reads off the encoder.
 
-        :param views: The same frame, augmented twice, as ``"obs"`` and ``"future"``
+        :param views: The same frame, augmented independently, as ``"obs"``, ``"future"`` and ``"past"``
         :return: ``leak_loss`` (per term) and ``leak_accuracy``
         """
         metrics = self.loss(views)[1]

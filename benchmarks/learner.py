@@ -9,14 +9,17 @@ How many updates a second each algorithm makes, and how far that is from what it
 `ratio_to_sb3` is how many times as fast as Stable-Baselines3's own SAC with the same encoder, batch and threads.
 `ratio_to_floor` is the time of an update over that of the bare encoder passes that the algorithm needs: 1 would be an
 algorithm that costs nothing beside its convolutions. All are timed in turn, again and again, so that a busy machine slows
-them alike; the medians count.
+them alike; the medians count. The floor has the memory allocator that the algorithm has.
 """
 
 import argparse
 import json
+import multiprocessing
 import statistics
 import time
+from collections import defaultdict
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 import gymnasium as gym
@@ -115,26 +118,40 @@ def _wait(device: str) -> None:
         th.cuda.synchronize()
 
 
+def work(pipe: Connection, threads: int, name: str, batch: int, image_size: int, device: str, options: dict[str, Any]) -> None:
+    """
+    Time one algorithm and its floor whenever the pipe says ``("update" or "floor", n)``; it takes the seconds back. In a
+    process of its own: `sb3_por` sets the memory allocator of its process, which would help Stable-Baselines3, too.
+    """
+    th.set_num_threads(threads)
+    model = make_model(name, batch, image_size, device, options)
+    calls = {"update": lambda: model.train(1, batch), "floor": make_floor(name, batch, image_size, device)}
+    for what, n in iter(pipe.recv, None):
+        pipe.send(seconds(calls[what], n, device))
+
+
 def measure(
-    names: list[str], batch: int, image_size: int, device: str, rounds: int, updates: int, options: dict[str, Any]
+    names: list[str], threads: int, batch: int, image_size: int, device: str, rounds: int, updates: int, options: dict[str, Any]
 ) -> list[dict[str, Any]]:
     """
     Time updates of the algorithms and their floors in turn.
 
     :return: a row for each algorithm
     """
-    calls: dict[tuple[str, str], Callable[[], Any]] = {}
+    context = multiprocessing.get_context("spawn")
+    pipes: dict[str, Connection] = {}
     for name in names:
-        model = make_model(name, batch, image_size, device, options)
-        calls[name, "update"] = lambda model=model: model.train(1, batch)
-        calls[name, "floor"] = make_floor(name, batch, image_size, device)
-    times: dict[tuple[str, str], list[float]] = {key: [] for key in calls}
-    for key, call in calls.items():
-        seconds(call, max(3, updates // 2), device)  # warm up
-    for _ in range(rounds):
-        for key, call in calls.items():
-            times[key].append(seconds(call, updates, device))
-    median = {key: statistics.median(values) for key, values in times.items()}
+        pipes[name], theirs = context.Pipe()
+        context.Process(target=work, args=(theirs, threads, name, batch, image_size, device, options), daemon=True).start()
+    times: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for _ in range(rounds + 1):
+        for name, pipe in pipes.items():
+            for what in ("update", "floor"):
+                pipe.send((what, updates))
+                times[name, what].append(pipe.recv())
+    for pipe in pipes.values():
+        pipe.send(None)
+    median = {key: statistics.median(values[1:]) for key, values in times.items()}  # the first round warms up
     stock = median.get(("sac (SB3)", "update"))
     return [
         {
@@ -188,7 +205,7 @@ def main() -> None:
     if arguments.profile:
         print(profile(arguments.profile, *where, arguments.updates, {}))
         return
-    rows = measure(arguments.algos, *where, arguments.rounds, arguments.updates, {})
+    rows = measure(arguments.algos, arguments.threads, *where, arguments.rounds, arguments.updates, {})
     print(json.dumps(rows, indent=1)) if arguments.json else print_table(rows)
 
 

@@ -20,6 +20,7 @@ from sb3_por.errors import UserError
 from sb3_por.loading import load_model
 from sb3_por.scores import read_scores
 from sb3_por.zoo import Experiment, check_policy, hyperparameter_file, main
+from softbody_envs import ENV_IDS
 
 ROOT = Path(__file__).parent.parent
 PENDULUM = ["--algo", "sac", "--env", "Pendulum-v1", "--eval-episodes", "2", "--seed", "1", "--num-threads", "1"]
@@ -229,3 +230,17 @@ def test_por_trains_on_pouring_from_the_command_line(tmp_path):
     assert type(model) is ALGORITHMS["sac_por"] and model.pairing == "paper"
     assert model.observation_space.shape == (3, 40, 40)
     assert len(read_scores([run])) == 1
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_settings_at_the_papers_scale_build_the_papers_encoder(algo):
+    settings = yaml.safe_load((ROOT / "zoo_hyperparams" / "paper" / f"{algo}.yml").read_text())
+    assert set(settings) == set(ENV_IDS) - {"FallingBall-v0", "SwingingBall-v0"}
+    for env_id, scale in (("PourWater-v0", 20), ("PourWaterAmount-v0", 20), ("StraightenRope-v0", 50), ("FoldCloth-v0", 50)):
+        assert settings[env_id]["reward_scale"] == scale and settings[env_id]["n_timesteps"] == 500_000
+    arguments = settings["DropFoldCloth-v0"]
+    env_kwargs, _ = arguments.pop("env_kwargs"), arguments.pop("n_timesteps")
+    env = gym.make("FallingBall-v0", **env_kwargs)
+    model = ALGORITHMS[algo](arguments.pop("policy"), env, **{**arguments, "buffer_size": 10})
+    assert [conv.stride[0] for conv in model.critic.features_extractor.trunk if hasattr(conv, "stride")] == [2, 1, 1, 1]
+    assert model.critic.projection.block_dims == [32 * 57 * 57]

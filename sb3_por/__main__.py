@@ -154,12 +154,19 @@ def _suite_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", metavar="SUITE.yml", help="algos, envs, seeds, and what else a suite says")
     parser.add_argument("--root", default="runs", help="runs go to <root>/<suite>/<env>/<algo>/seed_<seed> (default runs)")
     parser.add_argument("--dry-run", action="store_true", help="print the runs and their states, and do nothing")
+    parser.add_argument(
+        "--ray",
+        nargs="?",
+        const="auto",
+        metavar="ADDRESS",
+        help="do the runs on a Ray cluster: the one that this machine is of, or that of ADDRESS, such as 10.0.0.1:6379",
+    )
 
 
 def _suite(args: argparse.Namespace) -> int:
     from sb3_por.suite import run_suite
 
-    return run_suite(args.suite, args.root, args.dry_run)
+    return run_suite(args.suite, args.root, args.dry_run, args.ray)
 
 
 COMMANDS = {

@@ -41,6 +41,8 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str) -> Path:
     temporary.mkdir(parents=True)
     model.save(temporary / "model.zip")
     (temporary / "rng.pickle").write_bytes(pickle.dumps(get_rng_state(model.action_space)))
+    monitors = {file.name: file.stat().st_size for file in run.glob("*.monitor.csv")}
+    (temporary / "monitors.json").write_text(json.dumps(monitors))
     used: set[str] = set()
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None:
@@ -56,7 +58,7 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str) -> Path:
     temporary.rename(final)
     for stale in root.iterdir():
         if stale.name != "blocks" and stale != final:
-            shutil.rmtree(stale)
+            discard(stale)
     for block in (root / "blocks").glob("*"):
         if block.name not in used:
             block.unlink()
@@ -71,7 +73,24 @@ def latest_checkpoint(run: Path) -> Path | None:
 
 def remove_checkpoints(run: Path) -> None:
     """A finished run needs none."""
+    for folder in (run / CHECKPOINTS).glob("step_*"):
+        discard(folder)
     shutil.rmtree(run / CHECKPOINTS, ignore_errors=True)
+
+
+def discard(checkpoint: Path) -> None:
+    """Remove a checkpoint so that half of it is never taken for one."""
+    hidden = checkpoint.with_name(f".{uuid.uuid4().hex}")
+    checkpoint.rename(hidden)
+    shutil.rmtree(hidden)
+
+
+def restore_monitors(run: Path, checkpoint: Path) -> None:
+    """Remove the episodes that ended after a checkpoint from the run's ``*.monitor.csv``: they will be played again."""
+    for name, size in json.loads((checkpoint / "monitors.json").read_text()).items():
+        file = run / name
+        if file.stat().st_size > size:
+            os.truncate(file, size)
 
 
 def restore_buffer(model: BaseAlgorithm, checkpoint: Path) -> None:

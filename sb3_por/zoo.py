@@ -33,12 +33,12 @@ from stable_baselines3.common.vec_env import VecEnv
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import ALGORITHMS
 from sb3_por.callbacks import CheckpointCallback, EvaluationCallback
-from sb3_por.checkpoints import latest_checkpoint, read_rng_state, remove_checkpoints, restore_buffer
+from sb3_por.checkpoints import latest_checkpoint, read_rng_state, remove_checkpoints, restore_buffer, restore_monitors
 from sb3_por.errors import UserError, check_known, exit_code, one_line
 from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged
 from sb3_por.files import atomic_write, check_writable
 from sb3_por.loading import model_file, read_data
-from sb3_por.runs import current_commit, is_finished, read_settings, run_arguments, write_settings
+from sb3_por.runs import current_commit, read_settings, run_arguments, write_settings
 
 EXAMPLE = """example:
   python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:0.1 pairing:paper
@@ -134,7 +134,8 @@ class Parser(argparse.ArgumentParser):
         saved = run_arguments(run)
         if "env" not in saved:
             raise UserError(f"{run} is not the folder of a run: no */args.yml in it; give <log-folder>/<algo>/<env>_<n>")
-        if is_finished(run, saved["env"]):
+        if (run / f"{saved['env']}.zip").exists() and latest_checkpoint(run) is None:
+            remove_checkpoints(run)  # what is left of them if the run was killed while it removed them
             print(f"{run} is finished: nothing to do")
             raise SystemExit(0)
         self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
@@ -236,6 +237,8 @@ class Experiment(ExperimentManager):
         os.makedirs(self.params_path, exist_ok=True)
         self._folder_made = self._resumed_run is None
         self._lock_folder()
+        if self._resumed_run is not None and self._checkpoint is not None:
+            restore_monitors(self._resumed_run, self._checkpoint)
         if self.tensorboard_log is None and not self.optimize_hyperparameters:
             self.tensorboard_log = os.path.join(self.save_path, "tb")
 

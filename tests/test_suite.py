@@ -10,9 +10,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from sb3_por.__main__ import main
 from sb3_por.errors import UserError
-from sb3_por.suite import Suite, read_suite, suite_runs
+from sb3_por.suite_file import Suite, read_suite, suite_runs
 
 ROOT = Path(__file__).parent.parent
 
@@ -57,13 +60,33 @@ def test_a_suite_is_every_combination_with_its_settings(suite_file, tmp_path):
         ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\nworkers: 0\n", "grid.yml:4: workers must be a positive integer"),
         ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\nhyperparams: 3\n", "grid.yml:4: hyperparams must be a mapping"),
         ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\noverrides: {td3: {}}\n", "grid.yml:4: unknown run 'td3'"),
-        ("algos: [sac\n", "is not YAML"),
+        ("algos: [sac\n", "grid.yml:2: this is not YAML: expected ',' or ']'"),
+        ("- sac\n", "grid.yml:1: a suite is a mapping, of at least these lines: algos: [sac_por, sac]; envs:"),
+        ("algos:\n- sac\n- sacc\nenvs: [Pendulum-v1]\nseeds: [0]\n", "grid.yml:3: unknown algorithm 'sacc'"),
+        ("algos: [sac]\nenvs:\n- Pendulum-v1\n- Pendulum-v1\nseeds: [0]\n", "grid.yml:4: envs has Pendulum-v1 twice"),
+        ("algos: []\nenvs: [Pendulum-v1]\nseeds: [0]\n", "grid.yml:1: algos must be a list, such as [sac_por, sac]"),
+        ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [-1]\n", "grid.yml:3: seeds must be a list, such as [0, 1, 2]"),
+        ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\ngpus: many\n", "grid.yml:4: gpus must be a number such as 1"),
+        (
+            "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\noverrides:\n  sac:\n    gamma: 1\n    gamma: 0.9\n",
+            "grid.yml:7: gamma stands on line 6, too; keep one",
+        ),
     ],
 )
 def test_bad_suite_files_name_the_line_and_the_fix(text, message, suite_file):
     with pytest.raises(UserError) as error:
         read_suite(suite_file(text))
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@given(st.text(alphabet="algosenvd: [],-{}&*!|\n\t'0.", max_size=40))
+@settings(max_examples=200, deadline=None)
+def test_whatever_a_suite_file_holds_the_error_is_one_line(tmp_path_factory, text):
+    path = tmp_path_factory.getbasetemp() / "any.yml"
+    path.write_text(text)
+    with pytest.raises(UserError) as error:
+        read_suite(path)
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
 
 def test_the_suites_that_come_along_are_sound():

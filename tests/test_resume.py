@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_por import SACPOR, checkpoints
-from sb3_por.checkpoints import latest_checkpoint, read_rng_state, restore_buffer, save_checkpoint
+from sb3_por.checkpoints import latest_checkpoint, read_rng_state, remove_checkpoints, restore_buffer, save_checkpoint
 from sb3_por.loading import load_model
 from sb3_por.zoo import main
 
@@ -110,12 +110,19 @@ def assert_finished(run):
     assert files - {".lock"} == models | settings | others
     model = load_model(run / "Pendulum-v1.zip")
     assert model.num_timesteps == N_STEPS and model._n_updates == N_STEPS - 50
+    for network in (model.actor, model.critic):
+        assert {state["step"].item() for state in network.optimizer.state.values()} == {N_STEPS - 50}
+    lengths = [int(row.split(",")[1]) for row in (run / "0.monitor.csv").read_text().splitlines()[2:]]
+    assert set(lengths) <= {200} and sum(lengths) <= N_STEPS
     with np.load(run / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == EVALUATED
         assert (np.diff(file["wall_clock_s"]) > 0).all()
     with open(run / "replay_buffer.pkl", "rb") as file:
         buffer = pickle.load(file)
     assert buffer.full and buffer.pos == N_STEPS % 500
+    cos, sin, speed = buffer.observations[:, 0].T
+    cost = np.arctan2(sin, cos) ** 2 + 0.1 * speed**2 + 0.001 * (2 * buffer.actions[:, 0, 0]) ** 2
+    assert np.allclose(buffer.rewards[:, 0], -cost, atol=1e-3)
     # Each observation is followed by the next one, but where an episode or a process ended.
     follows = (buffer.next_observations[:-1] == buffer.observations[1:]).all(axis=(1, 2))
     assert follows.mean() > 0.9
@@ -124,11 +131,14 @@ def assert_finished(run):
 
 
 def kill_during(command, run, past_step, delay):
-    """Start a command and kill it some time after it has a checkpoint past a step; True if it was still running."""
+    """
+    Start a command and kill it some time after it has a checkpoint past a step, or with -1 after it was started; True if
+    it was still running.
+    """
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     while process.poll() is None:
         folder = latest_checkpoint(run)
-        if folder is not None and int(folder.name.removeprefix("step_")) > past_step:
+        if past_step < 0 or (folder is not None and int(folder.name.removeprefix("step_")) > past_step):
             time.sleep(delay)
             process.send_signal(signal.SIGKILL)
             break
@@ -139,18 +149,16 @@ def kill_during(command, run, past_step, delay):
 
 
 def kill_and_finish(folder, n_kills, rng):
+    """Two of three kills hit the training some way on, the third a process that starts, loads or trains."""
     run = folder / "sac" / "Pendulum-v1_1"
     command = [sys.executable, "train.py", *FLAGS, *OFTEN, "-f", str(folder), *SMALL]
-    killed = 0
-    while killed < n_kills and kill_during(
-        command, run, past_step=killed * N_STEPS // (n_kills + 2), delay=rng.uniform(0, 0.5)
-    ):
-        killed += 1
+    for n in range(n_kills):
+        anywhere = n % 3 == 2
+        past_step = -1 if anywhere else n * N_STEPS // (n_kills + 2)
+        assert kill_during(command, run, past_step, delay=rng.uniform(0, 8 if anywhere else 0.5)), "it ended too early"
         command = [sys.executable, "train.py", "--resume", str(run)]
-    assert killed > 0
-    if (run / "checkpoint").exists():
-        # In this process: it starts faster.
-        assert main(["--resume", str(run)]) == 0
+    # In this process: it starts faster.
+    assert main(["--resume", str(run)]) == 0
     return run
 
 
@@ -159,9 +167,50 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_ten_kills_at_random_moments(tmp_path):
-    assert_finished(kill_and_finish(tmp_path, 10, random.Random(1)))
+@pytest.mark.timeout(900)
+def test_a_run_killed_at_ten_random_moments_ends_like_an_uninterrupted_one(tmp_path):
+    assert main([*FLAGS, *OFTEN, "-f", str(tmp_path / "whole"), *SMALL]) == 0
+    whole = tmp_path / "whole" / "sac" / "Pendulum-v1_1"
+    assert_finished(whole)
+    killed = kill_and_finish(tmp_path / "killed", 10, random.Random(1))
+    assert_finished(killed)
+    with np.load(whole / "evaluations.npz") as first, np.load(killed / "evaluations.npz") as second:
+        assert {name: first[name].shape for name in first} == {name: second[name].shape for name in second}
+
+
+def test_a_resumed_run_forgets_the_episodes_that_it_plays_again(tmp_path, monkeypatch):
+    def die(callback):
+        if callback.num_timesteps == 220:
+            raise RuntimeError("killed")
+        return True
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_por.zoo.CheckpointCallback._on_step", die)
+        with pytest.raises(RuntimeError, match="killed"):
+            main([*FLAGS, "-n", "360", "--save-freq", "150", "--eval-freq", "-1", "-f", str(tmp_path), *SMALL])
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    monitor = run / "0.monitor.csv"
+    with open(monitor, "a") as file:
+        file.write("-900.1,2")  # a row that a kill cut
+    assert len(monitor.read_text().splitlines()) == 4
+    assert main(["--resume", str(run)]) == 0
+    rows = monitor.read_text().splitlines()[2:]
+    assert len(rows) == 1 and rows[0].split(",")[1] == "200", "the episode of steps 150 to 350"
+
+
+def test_a_kill_while_checkpoints_are_removed_leaves_a_finished_run(tmp_path, monkeypatch, capsys):
+    assert main([*FLAGS, "-n", "60", "--eval-freq", "-1", "-f", str(tmp_path), *SMALL]) == 0
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    save_checkpoint(load_model(run / "Pendulum-v1.zip"), run, "Pendulum-v1")
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.rmtree", lambda *_, **__: (_ for _ in ()).throw(OSError("killed here")))
+        with pytest.raises(OSError, match="killed here"):
+            remove_checkpoints(run)
+    assert (run / "checkpoint").exists() and latest_checkpoint(run) is None
+    with pytest.raises(SystemExit) as exit:
+        main(["--resume", str(run)])
+    assert exit.value.code == 0 and "is finished: nothing to do" in capsys.readouterr().out
+    assert not (run / "checkpoint").exists()
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_again_in_its_folder(tmp_path):

@@ -28,6 +28,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 import softbody_envs  # noqa: F401  registers the tasks
+from sb3_por.acceleration import PRECISIONS
 from sb3_por.algorithms import SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ
 from sb3_por.encoders import ConvEncoder, make_projection
 from sb3_por.visual_sac import VisualSAC
@@ -131,7 +132,14 @@ def work(pipe: Connection, threads: int, name: str, batch: int, image_size: int,
 
 
 def measure(
-    names: list[str], threads: int, batch: int, image_size: int, device: str, rounds: int, updates: int, options: dict[str, Any]
+    names: list[str],
+    threads: int,
+    batch: int,
+    image_size: int,
+    device: str,
+    rounds: int,
+    updates: int,
+    options: dict[str, Any],
 ) -> list[dict[str, Any]]:
     """
     Time updates of the algorithms and their floors in turn.
@@ -199,13 +207,16 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7, help="how often each algorithm has its turn")
     parser.add_argument("--updates", type=int, default=5, help="updates in a turn")
     parser.add_argument("--profile", choices=ALGORITHMS, metavar="ALGO", help="profile one algorithm instead")
+    parser.add_argument("--precision", choices=PRECISIONS, default="float32", help="of our algorithms")
+    parser.add_argument("--compile", metavar="MODE", help="compile our networks with this mode of torch.compile")
     arguments = parser.parse_args()
+    options = {"precision": arguments.precision, "compile_mode": arguments.compile}
     th.set_num_threads(arguments.threads)
     where = (arguments.batch, arguments.image_size, arguments.device)
     if arguments.profile:
-        print(profile(arguments.profile, *where, arguments.updates, {}))
+        print(profile(arguments.profile, *where, arguments.updates, options))
         return
-    rows = measure(arguments.algos, arguments.threads, *where, arguments.rounds, arguments.updates, {})
+    rows = measure(arguments.algos, arguments.threads, *where, arguments.rounds, arguments.updates, options)
     print(json.dumps(rows, indent=1)) if arguments.json else print_table(rows)
 
 

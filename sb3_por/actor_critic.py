@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_por.acceleration import check_precision, compile_networks
 from sb3_por.augmentations import RandomShift
 from sb3_por.memory import keep_freed_memory
 from sb3_por.objectives.base import Objective
@@ -46,6 +47,10 @@ class VisualActorCritic(ABC):
     :param overlap: Train while the environments make the next step, which pays with worker processes
         (``SubprocVecEnv``). Updates that are due after a rollout are made in the first step of the next one, always
         between sending the actions and waiting for the results, so that runs stay reproducible
+    :param precision: Of the updates: ``"float32"``, ``"tf32"`` (matrix products and convolutions of a GPU that has it;
+        a setting of the whole process), or ``"bfloat16"`` (automatic mixed precision)
+    :param compile_mode: Compile the networks with this mode of ``torch.compile``, for example ``"default"`` or
+        ``"reduce-overhead"`` (CUDA graphs); None for none
     """
 
     def __init__(
@@ -66,8 +71,13 @@ class VisualActorCritic(ABC):
         n_target_augmentations: int = 1,
         diagnostics_interval: int = 200,
         overlap: bool = False,
+        precision: str = "float32",
+        compile_mode: str | None = None,
         **kwargs: Any,
     ):
+        check_precision(precision)
+        self.precision = precision
+        self.compile_mode = compile_mode
         self.encoder_tau = encoder_tau
         self.actor_update_interval = actor_update_interval
         self.reward_scale = reward_scale
@@ -111,6 +121,11 @@ class VisualActorCritic(ABC):
         self._check_buffer()
         if self.device.type == "cpu":
             keep_freed_memory()
+        if self.precision == "tf32":
+            th.set_float32_matmul_precision("high")
+            th.backends.cudnn.allow_tf32 = True
+        if self.compile_mode is not None:
+            compile_networks(self.policy, self.compile_mode)
         self._metrics = defaultdict(list)
         self._augment = RandomShift(self.augmentation_pad)
         self._image_keys = self._find_image_keys()
@@ -194,7 +209,8 @@ class VisualActorCritic(ABC):
             self.actor.reset_noise()
         views = self._make_views(replay_data)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
-        critic_loss, objective_loss = self._encoder_losses(replay_data, views, ent_coef)
+        with self._autocast():
+            critic_loss, objective_loss = self._encoder_losses(replay_data, views, ent_coef)
 
         self._diagnose(replay_data, critic_loss, objective_loss)
         self.critic.optimizer.zero_grad()
@@ -209,6 +225,10 @@ class VisualActorCritic(ABC):
 
         self._metrics["ent_coef"].append(ent_coef.reshape(()))
         self._metrics["critic_loss"].append(critic_loss.detach())
+
+    def _autocast(self) -> th.autocast:
+        """Mixed precision for the forward passes of an update, if asked for."""
+        return th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bfloat16")
 
     def _encoder_losses(self, replay_data: Any, views: Views, ent_coef: th.Tensor) -> tuple[th.Tensor, th.Tensor | float]:
         """L_RL and lambda * L_objective: the two losses that train the encoder."""
@@ -296,10 +316,11 @@ class VisualActorCritic(ABC):
 
     def _update_actor(self, views: Views, ent_coef: th.Tensor) -> None:
         """One step of actor and temperature. No gradient reaches critic and encoder."""
-        actions, log_prob = self.actor.action_log_prob_of(self._actor_input(views, "obs"))
-        with th.no_grad():
-            features = self.critic.projection(views.trunk("obs"))
-        actor_loss = (ent_coef * log_prob - self._actor_values(features, actions)).mean()
+        with self._autocast():
+            actions, log_prob = self.actor.action_log_prob_of(self._actor_input(views, "obs"))
+            with th.no_grad():
+                features = self.critic.projection(views.trunk("obs"))
+            actor_loss = (ent_coef * log_prob - self._actor_values(features, actions)).mean()
         self.actor.optimizer.zero_grad()
         # Named inputs: the critic's weights get no gradient, and none is computed for them
         actor_loss.backward(inputs=[p for group in self.actor.optimizer.param_groups for p in group["params"]])

@@ -92,27 +92,50 @@ def _enjoy(args: argparse.Namespace) -> None:
 
 
 def _plot_arguments(parser: argparse.ArgumentParser) -> None:
+    from sb3_por.figures import KINDS, ORDER
     from sb3_por.scores import METRICS
 
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
-    parser.add_argument("-o", "--output", required=True, help="the figure: .png, .pdf or .svg")
+    output = "the figure: .png, .pdf or .svg; .csv: its numbers; with --kind all a folder for every figure in all formats"
+    parser.add_argument("-o", "--output", required=True, help=output)
+    kinds = f"which figure (default iqm); {ORDER}: loss and accuracy of POR's classifier, from the runs' TensorBoard files"
+    parser.add_argument("--kind", choices=[*KINDS, ORDER, "all"], default="iqm", help=kinds)
     parser.add_argument("--metric", choices=METRICS, default=METRICS[0], help=f"what to plot (default {METRICS[0]})")
+    step = "compare at this step, and leave out runs that end before (default: the end of the shortest run)"
+    parser.add_argument("--step", type=int, help=step)
     parser.add_argument("--csv", help="write the table of scores here, too")
     parser.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default 0)")
 
 
 def _plot(args: argparse.Namespace) -> None:
-    from sb3_por.files import check_output
-    from sb3_por.plots import plot
+    from sb3_por import figures
+    from sb3_por.files import check_output, check_writable
+    from sb3_por.order_logs import find_order, read_order, write_order
     from sb3_por.scores import read_scores, write_csv
 
+    if args.kind == "all":
+        check_writable(args.output)
+    else:
+        check_output(args.output, figures.SUFFIXES)
     if args.csv:
         check_output(args.csv, (".csv",))
-    scores = read_scores(args.paths)
-    for note in plot(scores, args.output, args.metric, seed=args.seed):
+    if args.kind == figures.ORDER:
+        order = read_order(args.paths)
+        plot, notes = figures.plot_order(order, args.step)
+        plot.save(args.output)
+    else:
+        scores = read_scores(args.paths)
+        how = {"metric": args.metric, "step": args.step, "seed": args.seed}
+        if args.kind == "all":
+            plots, notes = figures.plot_all(scores, find_order(args.paths), **how)
+            figures.save_all(plots, args.output)
+        else:
+            plot, notes = figures.plot(scores, args.kind, **how)
+            plot.save(args.output)
+    for note in notes:
         print(f"note: {note}", file=sys.stderr)
     if args.csv:
-        write_csv(scores, args.csv)
+        write_order(order, args.csv) if args.kind == figures.ORDER else write_csv(scores, args.csv)
     print(args.output)
 
 
@@ -183,8 +206,8 @@ COMMANDS = {
         run=_enjoy,
     ),
     "plot": Command(
-        help="draw learning curves: interquartile mean with 95 % stratified bootstrap intervals",
-        example="logs/sac_por logs/sac -o curve.png --csv scores.csv",
+        help="draw learning curves and comparisons with 95 % stratified bootstrap intervals",
+        example="logs/sac_por logs/sac --kind tasks -o tasks.pdf --csv scores.csv",
         add_arguments=_plot_arguments,
         run=_plot,
     ),
@@ -210,6 +233,7 @@ COMMANDS = {
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    typed = (sys.argv[1:] if arguments is None else arguments)[:1]
     parser = Parser(prog="python -m sb3_por", description=__doc__)
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for name, command in COMMANDS.items():
@@ -219,7 +243,8 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
             description=command.help,
             epilog=f"example: python -m sb3_por {name} {command.example}",
         )
-        command.add_arguments(subparser)
+        if name in typed:  # the others' arguments are not asked for, and cost imports
+            command.add_arguments(subparser)
     return parser.parse_args(arguments)
 
 

@@ -1,169 +1,195 @@
-"""Learning curves with the interquartile mean and stratified bootstrap intervals, through rliable."""
+"""The figures: a table of ``statistics.py`` each, drawn to be read without a caption."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+import math
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from rliable import library as rly
-from scipy.stats import trim_mean
 
-from sb3_por.errors import UserError
-from sb3_por.files import atomic_write, check_output
-from sb3_por.scores import METRICS
+from sb3_por.drawing import curve, interval, legend_below, looks, name_rows, one_panel, panels, steps_axis, style
+from sb3_por.statistics import in_order
 
-#: Okabe and Ito's colours, told apart by readers with any colour vision, and line styles for print in grey.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)))
-FORMATS = (".png", ".pdf", ".svg")
+LABELS = {
+    "normalized_performance": "normalized performance",
+    "return": "return",
+    "success": "success rate",
+    "por_loss": "POR loss",
+    "por_accuracy": "POR accuracy",
+}
+#: What a classifier that knows nothing has, its name, and the limits of the axis.
+CHANCE = {"por_loss": (math.log(2), "ln 2", (0, 1.05)), "por_accuracy": (0.5, "½", (0.3, 1.02))}
 
-LABELS = {"normalized_performance": "normalized performance", "return": "return", "success": "success rate"}
+BOOTSTRAP = "95 % stratified bootstrap interval"
 
 
-@dataclass(frozen=True)
-class Curve:
+def draw_iqm(table: pd.DataFrame, metric: str) -> Figure:
     """
-    Interquartile mean over runs and tasks, with its interval, at each evaluation.
-
-    :param steps: environment steps, shape ``(evaluations,)``
-    :param iqm: same shape
-    :param low: lower end of the 95 % interval
-    :param high: upper end of the 95 % interval
-    :param n_seeds: runs of each task
-    :param envs: the tasks
+    :param table: of :func:`sb3_por.statistics.iqm_curves`
+    :param metric: what the scores are, for the labels; here and below
     """
-
-    steps: np.ndarray
-    iqm: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    n_seeds: int
-    envs: tuple[str, ...]
-
-
-def iqm(scores: np.ndarray) -> np.ndarray:
-    """
-    Interquartile mean over runs and tasks, all evaluations at once: ten times as fast as rliable's one by one.
-
-    :param scores: shape ``(runs, tasks, evaluations)``
-    :return: shape ``(evaluations,)``
-    """
-    return trim_mean(scores.reshape(-1, scores.shape[-1]), 0.25, axis=0)
-
-
-def learning_curves(
-    scores: pd.DataFrame, metric: str = "normalized_performance", reps: int = 2000, seed: int = 0
-) -> tuple[dict[str, Curve], list[str]]:
-    """
-    :param scores: a table of scores
-    :param metric: one of ``METRICS``
-    :param reps: bootstrap samples
-    :param seed: of the bootstrap; the same scores and seed give the same intervals
-    :return: algorithm -> curve, and what was left out of them, one sentence each
-    :raises UserError: if nothing of the metric is recorded
-    """
-    notes: list[str] = []
-    sound = scores.dropna(subset=[metric])
-    if sound.empty:
-        recorded = [name for name in METRICS if scores[name].notna().any()]
-        raise UserError(f"no {metric} is recorded; there is {' and '.join(recorded) or 'no score at all'} (--metric)")
-    if len(sound) < len(scores):
-        notes.append(f"{len(scores) - len(sound)} of {len(scores)} evaluations have no {metric} and are left out")
-    curves = {}
-    for algo, rows in sound.groupby("algo", sort=True):
-        steps, matrix, envs = _matrix(str(algo), rows, metric, notes)
-        curves[str(algo)] = _curve(steps, matrix, envs, reps, seed)
-    return curves, notes
-
-
-def _matrix(algo: str, rows: pd.DataFrame, metric: str, notes: list[str]) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Steps, scores of shape ``(runs, tasks, evaluations)``, and tasks; what does not fit into them is noted."""
-    runs = {
-        env: [(run["step"].to_numpy(), run[metric].to_numpy()) for _, run in of_env.groupby("seed", sort=True)]
-        for env, of_env in rows.groupby("env", sort=True)
-    }
-    n_runs = min(map(len, runs.values()))
-    for env, of_env in runs.items():
-        if len(of_env) > n_runs:
-            notes.append(f"{algo}: {len(of_env)} seeds on {env} but {n_runs} elsewhere, so the first {n_runs} are used")
-        runs[env] = of_env[:n_runs]
-    every = [run for of_env in runs.values() for run in of_env]
-    first, last = max(steps[0] for steps, _ in every), min(steps[-1] for steps, _ in every)
-    if first > last:
-        raise UserError(f"{algo}: the runs have no step in common ({first} > {last})")
-    if last < max(steps[-1] for steps, _ in every):
-        notes.append(f"{algo}: the runs differ in length, so the curve ends with the shortest, at step {last}")
-    grid = np.unique(np.concatenate([steps for steps, _ in every]))
-    grid = grid[(grid >= first) & (grid <= last)]
-    matrix = np.array([[np.interp(grid, *run) for run in of_env] for of_env in runs.values()])
-    return grid, matrix.swapaxes(0, 1), tuple(runs)
-
-
-def _curve(steps: np.ndarray, matrix: np.ndarray, envs: tuple[str, ...], reps: int, seed: int) -> Curve:
-    # rliable draws from NumPy's global generator and ignores its own argument for one.
-    state = np.random.get_state()
-    np.random.seed(seed)
-    try:
-        point, interval = rly.get_interval_estimates({"": matrix}, iqm, reps=reps)
-    finally:
-        np.random.set_state(state)
-    return Curve(steps, point[""], interval[""][0], interval[""][1], len(matrix), envs)
-
-
-def draw_curves(curves: dict[str, Curve], metric: str = "normalized_performance") -> Figure:
-    """
-    :param curves: algorithm -> curve
-    :param metric: what the curves show, for the label
-    :return: a figure, readable without a caption
-    """
-    with matplotlib.rc_context({"font.size": 11, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(7, 4.5), layout="constrained")
-        axes = figure.add_subplot()
-        for i, (algo, curve) in enumerate(curves.items()):
-            seeds = f"{curve.n_seeds} seed{'s' if curve.n_seeds > 1 else ''}"
-            label = f"{algo} ({seeds}, {len(curve.envs)} tasks)" if len(curve.envs) > 1 else f"{algo} ({seeds})"
-            look: dict[str, Any] = dict(color=COLORS[i % len(COLORS)], linestyle=STYLES[i % len(STYLES)])
-            marker = "o" if len(curve.steps) < 30 else None
-            axes.plot(curve.steps, curve.iqm, label=label, linewidth=2, marker=marker, markersize=4, **look)
-            axes.fill_between(curve.steps, curve.low, curve.high, color=look["color"], alpha=0.2, linewidth=0)
-        envs = sorted({env for curve in curves.values() for env in curve.envs})
+    by_algo, tasks = looks(table["algo"]), table["tasks"].max()
+    envs = sorted({env for names in table["envs"].unique() for env in names.split()})
+    with style():
+        figure, axes = one_panel()
+        for algo, rows in _algos(table):
+            where = f", {_count(rows['tasks'], 'task')}" if tasks > 1 else ""
+            label = f"{algo} ({_count(rows['seeds'], 'seed')}{where})"
+            curve(axes, rows["step"], rows["iqm"], rows["low"], rows["high"], by_algo[algo], label)
         # The bootstrap draws runs within each task: one run a task leaves nothing to draw.
-        single = all(curve.n_seeds == 1 for curve in curves.values())
-        spread = "one seed, no interval" if single else "interquartile mean, 95 % stratified bootstrap interval"
-        axes.set_title(f"{', '.join(envs)}\n{spread}", fontsize=11, loc="left")
-        axes.set_xlabel("environment steps")
+        spread = "one seed, no interval" if _single(table) else BOOTSTRAP
+        over = ["seeds"] * (not _single(table)) + ["tasks"] * (tasks > 1)
+        what = f"interquartile mean over {' and '.join(over)}, " if over else ""
+        axes.set_title(f"{', '.join(envs)}\n{what}{spread}")
+        steps_axis(axes)
         axes.set_ylabel(LABELS[metric])
-        axes.grid(alpha=0.3)
-        axes.legend(frameon=False)
+        axes.legend()
     return figure
 
 
-def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, PDF or SVG, byte for byte the same for the same figure."""
-    path = check_output(path, FORMATS)
-    metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower())
-    with atomic_write(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "sb3-por"}):
-        figure.savefig(temporary, dpi=150, metadata=metadata)
-
-
-def plot(
-    scores: pd.DataFrame, path: str | Path, metric: str = "normalized_performance", reps: int = 2000, seed: int = 0
-) -> Iterable[str]:
+def draw_tasks(table: pd.DataFrame, metric: str) -> Figure:
     """
-    Draw the learning curve of each algorithm in a table of scores.
-
-    :param scores: a table of scores
-    :param path: ``.png``, ``.pdf`` or ``.svg``
-    :param metric: one of ``METRICS``
-    :param reps: bootstrap samples
-    :param seed: of the bootstrap
-    :return: what was left out, one sentence each
+    :param table: of :func:`sb3_por.statistics.task_curves`
     """
-    path = check_output(path, FORMATS)
-    curves, notes = learning_curves(scores, metric, reps, seed)
-    save_figure(draw_curves(curves, metric), path)
-    return notes
+    by_algo, envs = looks(table["algo"]), sorted(table["env"].unique())
+    with style():
+        figure, grid = panels(len(envs), height=3.2)
+        for axes, env in zip(grid, envs, strict=True):
+            for algo, rows in _algos(table[table["env"] == env]):
+                low, high = rows["mean"] - rows["std"], rows["mean"] + rows["std"]
+                curve(axes, rows["step"], rows["mean"], low, high, by_algo[algo], algo)
+            axes.set_title(env)
+            axes.set_ylabel(LABELS[metric])
+            steps_axis(axes)
+        legend_below(figure, grid, _spread(table))
+    return figure
+
+
+def draw_profiles(table: pd.DataFrame, metric: str) -> Figure:
+    """
+    :param table: of :func:`sb3_por.statistics.performance_profiles`
+    """
+    by_algo = looks(table["algo"])
+    with style():
+        figure, axes = one_panel()
+        for algo, rows in _algos(table):
+            label = f"{algo} ({_count(rows['seeds'], 'seed')}, {_count(rows['tasks'], 'task')})"
+            color, line, _ = by_algo[algo]
+            axes.plot(rows["threshold"], rows["fraction"], label=label, color=color, linestyle=line, drawstyle="steps-post")
+            axes.fill_between(rows["threshold"], rows["low"], rows["high"], color=color, alpha=0.15, linewidth=0, step="post")
+        axes.set_title(f"performance profile at step {_step(table)}, {'no interval' if _single(table) else BOOTSTRAP}")
+        axes.set_xlabel(f"{LABELS[metric]} τ")
+        axes.set_ylabel("fraction of runs above τ")
+        axes.set_ylim(-0.02, 1.04)
+        axes.legend()
+    return figure
+
+
+def draw_aggregates(table: pd.DataFrame, metric: str) -> Figure:
+    """
+    :param table: of :func:`sb3_por.statistics.aggregates`
+    """
+    by_algo, names = looks(table["algo"]), list(dict.fromkeys(table["statistic"]))
+    with style():
+        figure = Figure(figsize=(2.8 * len(names) + 1, 0.45 * table["algo"].nunique() + 1.6), layout="constrained")
+        for axes, name in zip(figure.subplots(1, len(names), sharey=True, squeeze=False)[0], names, strict=True):
+            algos = _algos(table[table["statistic"] == name])
+            for i, (algo, rows) in enumerate(algos):
+                row = rows.iloc[0]
+                interval(axes, i, row["value"], row["low"], row["high"], by_algo[algo])
+            name_rows(axes, [algo for algo, _ in algos])
+            axes.set_title(f"{name} ({'lower' if name == 'optimality gap' else 'higher'} is better)")
+            axes.set_xlabel(LABELS[metric])
+        what = "one seed, no interval" if _single(table) else BOOTSTRAP
+        figure.suptitle(f"all tasks at step {_step(table)}, {what}", fontsize=11, x=0.01, ha="left")
+    return figure
+
+
+def draw_improvements(table: pd.DataFrame, metric: str) -> Figure:
+    """
+    :param table: of :func:`sb3_por.statistics.improvements`
+    """
+    by_algo = looks(table["algo"])
+    with style():
+        figure = Figure(figsize=(7, 0.4 * len(table) + 1.5), layout="constrained")
+        axes = figure.add_subplot()
+        for i, row in enumerate(table.itertuples()):
+            interval(axes, i, row.probability, row.low, row.high, by_algo[row.algo])
+        name_rows(axes, [f"{row.algo} over {row.rival}" for row in table.itertuples()])
+        axes.axvline(0.5, color="0.4", linewidth=1)
+        axes.set_xlim(-0.03, 1.03)
+        axes.set_title(f"probability of improvement at step {_step(table)}, 95 % interval")
+        axes.set_xlabel(f"how likely a run of the first has the higher {LABELS[metric]}")
+    return figure
+
+
+def draw_ratios(table: pd.DataFrame, metric: str) -> Figure:
+    """
+    :param table: of :func:`sb3_por.statistics.ratios`
+    """
+    by_algo, envs = looks(table["algo"]), sorted(table["env"].unique())
+    with style():
+        figure, grid = panels(len(envs), height=0.4 * table.groupby("env").size().max() + 1.3)
+        for axes, env in zip(grid, envs, strict=True):
+            rows = table[table["env"] == env]
+            for i, row in enumerate(rows.itertuples()):
+                if np.isfinite(row.ratio):
+                    interval(axes, i, row.ratio, row.low, row.high, by_algo[row.algo])
+            name_rows(axes, [f"{row.algo} : {row.rival}" for row in rows.itertuples()])
+            axes.axvline(1, color="0.4", linewidth=1)
+            axes.set_title(env)
+            axes.set_xlabel(f"ratio at step {_step(rows)}")
+        title = f"mean {LABELS[metric]} : the best rival's, 95 % bootstrap interval"
+        figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    return figure
+
+
+def draw_order(table: pd.DataFrame) -> Figure:
+    """
+    :param table: of :func:`sb3_por.statistics.order_curves`
+    """
+    by_algo, envs = looks(table["algo"]), sorted(table["env"].unique())
+    with style():
+        figure = Figure(figsize=(max(4 * len(envs), 6), 6.4), layout="constrained")
+        grid = figure.subplots(2, len(envs), sharex="col", squeeze=False)
+        for j, env in enumerate(envs):
+            here = table[table["env"] == env]
+            for axes, (metric, (chance, name, limits)) in zip(grid[:, j], CHANCE.items(), strict=True):
+                for algo, rows in _algos(here[here["metric"] == metric]):
+                    low, high = rows["mean"] - rows["std"], rows["mean"] + rows["std"]
+                    curve(axes, rows["step"], rows["mean"], low, high, by_algo[algo], algo)
+                for algo, rows in _algos(here[here["metric"] == metric.replace("por_", "por_leak_")]):
+                    look, label = by_algo[algo], f"{algo}, a frame and itself"
+                    axes.plot(rows["step"], rows["mean"], color=look.color, alpha=0.5, linewidth=1, label=label)
+                axes.axhline(chance, color="0.3", linewidth=1, linestyle=(0, (1, 2)), label="chance")
+                axes.text(1, chance, name, transform=axes.get_yaxis_transform(), va="bottom", ha="right", color="0.3")
+                axes.set_ylabel(LABELS[metric])
+                axes.set_ylim(*limits)
+            grid[0, j].set_title(env)
+            steps_axis(grid[1, j])
+        legend_below(figure, grid.ravel(), _spread(table))
+    return figure
+
+
+def _algos(table: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    return [(algo, table[table["algo"] == algo]) for algo in in_order(list(table["algo"].unique()))]
+
+
+def _count(column: pd.Series, noun: str) -> str:
+    """``3 seeds``; ``3-5 seeds`` where it is not the same everywhere."""
+    low, high = column.min(), column.max()
+    return f"{low}{f'-{high}' if high > low else ''} {noun}{'s' if high > 1 else ''}"
+
+
+def _single(table: pd.DataFrame) -> bool:
+    return bool(table["seeds"].max() == 1)
+
+
+def _spread(table: pd.DataFrame) -> str:
+    if _single(table):
+        return "one seed, no spread"
+    return f"mean ± standard deviation over {_count(table['seeds'], 'seed')}"
+
+
+def _step(table: pd.DataFrame) -> str:
+    """The step of a table that has one, thousands apart."""
+    return f"{table['step'].iloc[0]:,}".replace(",", " ")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,12 +27,22 @@ def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
     tables = [read_csv(path) for path in given if path.suffix == ".csv"]
     folders = [path for path in given if path.suffix != ".csv"]
     tables += [read_run(run) for run in find_runs(folders)]
-    scores = pd.concat(tables, ignore_index=True).sort_values([*RUN_KEYS, "step"], kind="stable", ignore_index=True)
-    doubled = scores[scores.duplicated([*RUN_KEYS, "step"])]
+    return join_runs(tables)
+
+
+def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:
+    """
+    :param tables: with the columns ``RUN_KEYS`` and step, at least one table; a run is in one of them
+    :return: all their rows, sorted
+    :raises UserError: if two runs of one algorithm and environment have one seed
+    """
+    rows = pd.concat(tables, ignore_index=True)
+    runs = pd.concat([table[RUN_KEYS].drop_duplicates() for table in tables])
+    doubled = pd.concat([runs[runs.duplicated()], rows[rows.duplicated([*RUN_KEYS, "step"])]])
     if len(doubled):
         env, algo, seed = doubled.iloc[0][RUN_KEYS]
         raise UserError(f"there are two runs of {algo} on {env} with seed {seed}; give one of them")
-    return scores
+    return rows.sort_values([*RUN_KEYS, "step"], kind="stable", ignore_index=True)
 
 
 def read_run(run: Path) -> pd.DataFrame:
@@ -47,22 +58,29 @@ def read_run(run: Path) -> pd.DataFrame:
     except (OSError, EOFError, KeyError, ValueError) as error:
         raise UserError(f"cannot read {run / EVALUATIONS}: {one_line(error)}") from error
     unknown = np.full(len(steps), np.nan)
-    arguments = run_arguments(run)
-    name, _, number = run.name.rpartition("_")
     return pd.DataFrame(
         {
-            "env": arguments.get("env", name or run.name),
-            "algo": arguments.get("algo", run.parent.name),
-            "seed": int(arguments.get("seed", number if number.isdigit() else 0)),
+            **run_identity(run),
             "step": steps.astype(int),
             "normalized_performance": _episode_mean(arrays, "normalized_performance", unknown),
             "return": returns,
             "success": _episode_mean(arrays, "successes", unknown),
             "wall_clock_s": arrays.get("wall_clock_s", unknown),
-            "commit": arguments.get("commit", ""),
+            "commit": run_arguments(run).get("commit", ""),
         },
         columns=COLUMNS,
     )
+
+
+def run_identity(run: Path) -> dict[str, Any]:
+    """What ``RUN_KEYS`` are for a run: from its settings, else from its path."""
+    arguments = run_arguments(run)
+    name, _, number = run.name.rpartition("_")
+    return {
+        "env": arguments.get("env", name or run.name),
+        "algo": arguments.get("algo", run.parent.name),
+        "seed": int(arguments.get("seed", number if number.isdigit() else 0)),
+    }
 
 
 def read_csv(path: Path) -> pd.DataFrame:

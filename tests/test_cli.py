@@ -78,6 +78,16 @@ def test_plot_says_what_it_leaves_out(run, tmp_path, capsys):
     assert "note: 1 of 3 evaluations have no normalized_performance" in capsys.readouterr().err
 
 
+def test_plot_draws_every_figure_into_a_folder(run, tmp_path, capsys):
+    assert main(["plot", str(run), "--kind", "all", "-o", str(tmp_path / "figures")]) == 0
+    shown = capsys.readouterr()
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert {"iqm.png", "iqm.pdf", "iqm.csv", "tasks.png", "profile.pdf", "aggregates.csv"} <= names
+    assert "note: no figure improvement: there is one algorithm only (sac)" in shown.err
+    assert main(["plot", str(run), "--step", "150", "-o", str(tmp_path / "numbers.csv")]) == 0
+    assert (tmp_path / "numbers.csv").read_text().splitlines()[-1] == "sac,150,0.35,0.35,0.35,1,1,Pendulum-v1"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -97,6 +107,10 @@ def test_plot_says_what_it_leaves_out(run, tmp_path, capsys):
         (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "/proc/film.gif"], "cannot write in /proc"),
         (["plot", "nowhere", "-o", "curve.png"], "there is no folder nowhere"),
         (["plot", "RUN", "-o", "curve.txt"], "must end in .png or .pdf or .svg"),
+        (["plot", "RUN", "-o", "curve.png", "--kind", "curves"], "invalid choice: 'curves'"),
+        (["plot", "RUN", "-o", "curve.png", "--kind", "ratio"], "no two algorithms that learn from images"),
+        (["plot", "RUN", "-o", "curve.png", "--kind", "order"], "no run has logged a POR loss"),
+        (["plot", "RUN", "-o", "curve.png", "--step", "500"], "no run was evaluated at step 500"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, message, run, capsys):

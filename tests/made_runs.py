@@ -1,0 +1,44 @@
+"""Runs and tables of scores made for tests."""
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from sb3_por.scores import COLUMNS
+
+STEPS = [100, 200, 300]
+
+
+def write_run(folder, algo="sac_por", env="PourWater-v0", seed=1, performance=(0.1, 0.2, 0.4), steps=STEPS, settings=True):
+    """A run folder as train.py leaves it, two episodes an evaluation."""
+    run = folder / algo / f"{env}_{seed}"
+    (run / env).mkdir(parents=True)
+    if settings:
+        (run / env / "args.yml").write_text(yaml.safe_dump({"algo": algo, "env": env, "seed": seed, "commit": "abc"}))
+    episodes = np.array(performance)[:, None] + np.array([-0.05, 0.05])
+    np.savez(
+        run / "evaluations.npz",
+        timesteps=steps,
+        results=episodes * 100,
+        ep_lengths=np.full(episodes.shape, 100),
+        successes=episodes > 0.3,
+        normalized_performance=episodes,
+        wall_clock_s=np.array(steps) / 10,
+    )
+    return run
+
+
+def table(algo, env, seed, performance, steps=STEPS):
+    """The rows of one run in a table of scores."""
+    return pd.DataFrame(
+        {"env": env, "algo": algo, "seed": seed, "step": steps, "normalized_performance": performance, "commit": ""},
+        columns=COLUMNS,
+    )
+
+
+def random_scores(algos=("sac_por", "sac_drq", "sac"), envs=("T", "U"), n_seeds=4, steps=STEPS):
+    """A full grid of random scores; those of the first algorithm are 0.3 higher."""
+    rng = np.random.default_rng(0)
+    runs = [(algo, env, seed) for algo in algos for env in envs for seed in range(n_seeds)]
+    tables = [table(*run, 0.7 * rng.uniform(size=len(steps)) + 0.3 * (run[0] == algos[0]), steps) for run in runs]
+    return pd.concat(tables, ignore_index=True)

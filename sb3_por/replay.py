@@ -324,7 +324,8 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         slots = np.random.randint(0, self.size(), size=batch_size)
         envs = np.random.randint(0, self.n_envs, size=batch_size)
         gaps, past_gaps = (
-            None if limits is None else np.random.randint(limits[0], limits[1] + 1, size=batch_size) for limits in (future, past)
+            None if limits is None else np.random.randint(limits[0], limits[1] + 1, size=batch_size)
+            for limits in (future, past)
         )
         return self._samples(slots, envs, gaps, past_gaps, window, env)
 

@@ -74,7 +74,9 @@ class World:
     def add_box_floor(self) -> None:
         """A thick slab with its top at z = 0, for deformable worlds: on a plane a cloth never settles."""
         self.floor = Floor(0.0, half_size=5.0)
-        box = self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=(self.floor.half_size, self.floor.half_size, 0.5))
+        box = self.client.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=(self.floor.half_size, self.floor.half_size, 0.5)
+        )
         # Maximal coordinates are a sixth cheaper under a cloth.
         body = self.client.createMultiBody(0, box, basePosition=(0, 0, -0.5), useMaximalCoordinates=True)
         self.client.changeDynamics(body, -1, lateralFriction=1.0)

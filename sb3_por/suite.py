@@ -140,10 +140,10 @@ def _steps_per_second(pool: Pool, run: Run, steps: int) -> float:
 
 def _duration(seconds: float) -> str:
     """Such as ``1:05 h``, ``12 min`` or ``30 s``."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
-    if minutes >= 60:
-        return f"{minutes // 60}:{minutes % 60:02} h"
-    return f"{minutes} min" if minutes else f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02} h"
 
 
 def _total_steps(run: Run) -> int:

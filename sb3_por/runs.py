@@ -1,12 +1,18 @@
 """A run's folder, in the RL Zoo's layout: where its files are and what its settings say."""
 
+import os
+import platform
+import re
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
+import torch as th
 import yaml
+from filelock import FileLock, Timeout
 
 from sb3_por.errors import UserError
 from sb3_por.files import atomic_write
@@ -52,6 +58,20 @@ def is_finished(run: Path, env_id: str) -> bool:
     return (run / f"{env_id}.zip").exists() and not (run / CHECKPOINTS).exists()
 
 
+def is_running(run: Path) -> bool:
+    """Whether a process is at work in a run's folder, as far as can be told: on this machine."""
+    lock = run / ".lock"
+    if not lock.is_file():
+        return False
+    try:
+        with FileLock(lock, timeout=0):
+            return False
+    except Timeout:
+        return True
+    except OSError:  # a folder that can only be read
+        return False
+
+
 def progress(run: Path) -> tuple[int, float | None]:
     """
     :return: steps that the run has done, to the last episode's end, and its latest mean normalized performance
@@ -64,7 +84,7 @@ def progress(run: Path) -> tuple[int, float | None]:
     if (run / EVALUATIONS).is_file():
         with np.load(run / EVALUATIONS) as file:
             steps = max(steps, int(file["timesteps"][-1]))
-            latest = float(np.mean(file["normalized_performance"][-1]))
+            latest = float(np.mean(file["normalized_performance"][-1])) if "normalized_performance" in file else np.nan
         score = None if np.isnan(latest) else latest
     return steps, score
 
@@ -98,3 +118,18 @@ def current_commit() -> str:
     except (OSError, subprocess.CalledProcessError):
         return ""
     return commit.stdout.strip() + ("+" if changed.stdout.strip() else "")
+
+
+def current_machine() -> str:
+    """What this process runs on, in a line: processor, accelerator, memory, versions."""
+    info = Path("/proc/cpuinfo")
+    models = re.findall(r"model name\s*:\s*(.+)", info.read_text()) if info.is_file() else []
+    parts = [
+        f"{len(os.sched_getaffinity(0))} cores of {models[0].strip() if models else platform.machine()}",
+        *([th.cuda.get_device_name()] if th.cuda.is_available() else []),
+        f"{psutil.virtual_memory().total / 2**30:.0f} GiB",
+        platform.system(),
+        f"Python {platform.python_version()}",
+        f"PyTorch {th.__version__}",
+    ]
+    return ", ".join(parts)

@@ -127,6 +127,7 @@ class Parser(argparse.ArgumentParser):
             _check_hyperparameters(Path(args.conf_file), args.env)
         check_writable(args.log_folder)
         args.commit = current_commit()
+        args.machine = current_machine()
         return args
 
     def _resumed(self, run: Path) -> argparse.Namespace:

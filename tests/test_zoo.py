@@ -58,6 +58,7 @@ def test_a_run_leaves_the_zoos_files(finished_run):
 def test_settings_are_plain_yaml_that_the_zoo_reads(finished_run):
     args = yaml.safe_load((finished_run / "Pendulum-v1" / "args.yml").read_text())
     assert (args["algo"], args["env"], args["seed"], args["n_timesteps"]) == ("sac", "Pendulum-v1", 1, 400)
+    assert "cores of" in args["machine"] and "PyTorch" in args["machine"]
     config = yaml.safe_load((finished_run / "Pendulum-v1" / "config.yml").read_text())
     assert config["learning_starts"] == 50 and config["policy"] == "MlpPolicy"
     assert get_trained_models(str(finished_run.parent.parent)) == {"sac-Pendulum-v1": ("sac", "Pendulum-v1")}

@@ -38,7 +38,7 @@ from sb3_por.errors import UserError, check_known, exit_code, one_line
 from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged
 from sb3_por.files import atomic_write, check_writable
 from sb3_por.loading import model_file, read_data
-from sb3_por.runs import current_commit, read_settings, run_arguments, write_settings
+from sb3_por.runs import current_commit, current_machine, read_settings, run_arguments, write_settings
 
 EXAMPLE = """example:
   python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:0.1 pairing:paper

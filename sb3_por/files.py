@@ -1,6 +1,7 @@
 """Files that are whole or absent, and folders that can be written."""
 
 import os
+import re
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,6 +28,13 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(folder: str | os.PathLike[str]) -> None:
+    """Remove what a process that was killed inside ``atomic_write`` left at any depth of a folder where no other writes."""
+    for path in Path(folder).rglob(".*"):
+        if path.is_file() and re.fullmatch(r"\..+\.[0-9a-f]{32}(\.\w+)?", path.name):
+            path.unlink()
 
 
 def check_writable(folder: str | os.PathLike[str]) -> None:

@@ -36,7 +36,7 @@ from sb3_por.callbacks import CheckpointCallback, EvaluationCallback
 from sb3_por.checkpoints import latest_checkpoint, read_rng_state, remove_checkpoints, restore_buffer, restore_monitors
 from sb3_por.errors import UserError, check_known, exit_code, one_line
 from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged
-from sb3_por.files import atomic_write, check_writable
+from sb3_por.files import atomic_write, check_writable, remove_unfinished
 from sb3_por.loading import model_file, read_data
 from sb3_por.runs import current_commit, current_machine, read_settings, run_arguments, write_settings
 
@@ -238,8 +238,10 @@ class Experiment(ExperimentManager):
         os.makedirs(self.params_path, exist_ok=True)
         self._folder_made = self._resumed_run is None
         self._lock_folder()
-        if self._resumed_run is not None and self._checkpoint is not None:
-            restore_monitors(self._resumed_run, self._checkpoint)
+        if self._resumed_run is not None:
+            remove_unfinished(self._resumed_run)
+            if self._checkpoint is not None:
+                restore_monitors(self._resumed_run, self._checkpoint)
         if self.tensorboard_log is None and not self.optimize_hyperparameters:
             self.tensorboard_log = os.path.join(self.save_path, "tb")
 

@@ -17,6 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_por import SACPOR, checkpoints
 from sb3_por.checkpoints import latest_checkpoint, read_rng_state, remove_checkpoints, restore_buffer, save_checkpoint
+from sb3_por.files import atomic_write
 from sb3_por.loading import load_model
 from sb3_por.zoo import main
 
@@ -178,7 +179,7 @@ def test_a_run_killed_at_ten_random_moments_ends_like_an_uninterrupted_one(tmp_p
         assert {name: first[name].shape for name in first} == {name: second[name].shape for name in second}
 
 
-def test_a_resumed_run_forgets_the_episodes_that_it_plays_again(tmp_path, monkeypatch):
+def test_a_resumed_run_forgets_the_episodes_that_it_plays_again_and_removes_half_a_file(tmp_path, monkeypatch):
     def die(callback):
         if callback.num_timesteps == 220:
             raise RuntimeError("killed")
@@ -193,9 +194,16 @@ def test_a_resumed_run_forgets_the_episodes_that_it_plays_again(tmp_path, monkey
     with open(monitor, "a") as file:
         file.write("-900.1,2")  # a row that a kill cut
     assert len(monitor.read_text().splitlines()) == 4
+    with pytest.raises(SystemExit), monkeypatch.context() as patch:
+        with atomic_write(run / "rl_model_150_steps.zip") as unfinished:
+            unfinished.touch()
+            patch.setattr(Path, "unlink", lambda *_, **__: None)  # as after a kill
+            raise SystemExit
+    assert unfinished.exists()
     assert main(["--resume", str(run)]) == 0
     rows = monitor.read_text().splitlines()[2:]
     assert len(rows) == 1 and rows[0].split(",")[1] == "200", "the episode of steps 150 to 350"
+    assert not unfinished.exists()
 
 
 def test_a_kill_while_checkpoints_are_removed_leaves_a_finished_run(tmp_path, monkeypatch, capsys):

@@ -14,7 +14,7 @@ class ReferenceSettings:
 
     :param actor_update_interval: Update actor and temperature every that many updates
     :param target_update_interval: Update the target networks every that many updates
-    :param encoder_tau: Soft update coefficient of the momentum encoder f_m
+    :param encoder_tau: Soft update coefficient of the momentum encoder f_m; five times ``tau`` by default, at most 1
     :param tau: Soft update coefficient of the target Q networks
     """
 
@@ -23,10 +23,11 @@ class ReferenceSettings:
         *args: Any,
         actor_update_interval: int = 2,
         target_update_interval: int = 2,
-        encoder_tau: float | None = 0.05,
+        encoder_tau: float | None = None,
         tau: float = 0.01,
         **kwargs: Any,
     ):
+        encoder_tau = min(5 * tau, 1.0) if encoder_tau is None else encoder_tau
         super().__init__(
             *args,
             actor_update_interval=actor_update_interval,
@@ -107,7 +108,7 @@ class SACDrQ(ReferenceSettings, VisualSAC):
 
     :param n_augmentations: DrQ's M
     :param n_target_augmentations: DrQ's K
-    :param encoder_tau: That of the Q networks by default: DrQ has one for all
+    :param encoder_tau: ``tau`` by default: DrQ has one for all
     """
 
     def __init__(
@@ -116,13 +117,15 @@ class SACDrQ(ReferenceSettings, VisualSAC):
         n_augmentations: int = 2,
         n_target_augmentations: int = 2,
         encoder_tau: float | None = None,
+        tau: float = 0.01,
         **kwargs: Any,
     ):
         super().__init__(
             *args,
             n_augmentations=n_augmentations,
             n_target_augmentations=n_target_augmentations,
-            encoder_tau=encoder_tau,
+            encoder_tau=tau if encoder_tau is None else encoder_tau,
+            tau=tau,
             **kwargs,
         )
 

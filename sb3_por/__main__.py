@@ -192,6 +192,25 @@ def _suite(args: argparse.Namespace) -> int:
     return run_suite(args.suite, args.root, args.dry_run, args.ray)
 
 
+def _report_arguments(parser: argparse.ArgumentParser) -> None:
+    from sb3_por.scores import METRICS
+
+    parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
+    parser.add_argument("-o", "--output", required=True, help="folder that gets index.html, and figures/ for print")
+    parser.add_argument("--metric", choices=METRICS, help="what to compare (default: the first that is recorded)")
+    step = "compare at this step, and leave out runs that end before (default: the end of the shortest run)"
+    parser.add_argument("--step", type=int, help=step)
+    parser.add_argument("--no-films", action="store_true", help="do not play the best models: much quicker")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default 0)")
+
+
+def _report(args: argparse.Namespace) -> None:
+    import softbody_envs  # noqa: F401  (registers its ids)
+    from sb3_por.report import write_report
+
+    print(write_report(args.paths, args.output, args.metric, args.step, args.seed, films=not args.no_films))
+
+
 COMMANDS = {
     "evaluate": Command(
         help="play held-out episodes and print the scores",
@@ -228,6 +247,12 @@ COMMANDS = {
         example="suites/smoke.yml --dry-run",
         add_arguments=_suite_arguments,
         run=_suite,
+    ),
+    "report": Command(
+        help="write a page with what a set of runs was and has shown: figures, tables, films, settings, failures",
+        example="runs/smoke -o report",
+        add_arguments=_report_arguments,
+        run=_report,
     ),
 }
 

@@ -91,14 +91,16 @@ def plot(
     :raises UserError: if there is nothing to draw
     """
     grid = read_grid(scores, metric, step)
-    return _plot(grid, kind, reps, seed), grid.notes
-
-
-def _plot(grid: Grid, kind: str, reps: int, seed: int) -> Plot:
-    table = KINDS[kind].measure(grid, reps, seed)
-    if table.empty:
+    one = _plot(grid, kind, reps, seed)
+    if one is None:
         raise UserError("; ".join(grid.notes))
-    return Plot(kind, KINDS[kind].title, table, KINDS[kind].draw(table, grid.metric))
+    return one, grid.notes
+
+
+def _plot(grid: Grid, kind: str, reps: int, seed: int) -> Plot | None:
+    """``None`` if there is nothing to draw, which the grid's notes explain."""
+    table = KINDS[kind].measure(grid, reps, seed)
+    return None if table.empty else Plot(kind, KINDS[kind].title, table, KINDS[kind].draw(table, grid.metric))
 
 
 def plot_order(order: pd.DataFrame, step: int | None = None) -> tuple[Plot, list[str]]:
@@ -126,22 +128,22 @@ def plot_all(
     :param step: see :func:`sb3_por.grids.read_grid`
     :param reps: bootstrap samples
     :param seed: of the bootstrap
-    :return: every figure that can be drawn, and what was left out, which figures among it
-    :raises UserError: if none can be drawn
+    :return: every figure that can be drawn, and what was left out
+    :raises UserError: if nothing of the metric is recorded, or no run reaches the step
     """
     grid = read_grid(scores, metric, step)
-    plots, notes = [], []
+    plots = []
     for kind in KINDS:
         try:
             plots.append(_plot(grid, kind, reps, seed))
         except UserError as error:
-            notes.append(f"no figure {kind}: {error}")
-    notes = [*grid.notes, *notes]
+            grid.note(f"no figure {kind}: {error}")
+    notes = grid.notes
     if order is not None:
         figure, left_out = plot_order(order, step)
         plots.append(figure)
-        notes += left_out
-    return plots, list(dict.fromkeys(notes))
+        notes = [*notes, *left_out]
+    return [one for one in plots if one is not None], notes
 
 
 def save_all(plots: list[Plot], folder: str | Path) -> None:

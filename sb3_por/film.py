@@ -3,10 +3,11 @@
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import imageio.v2 as imageio
 from gymnasium.wrappers import RenderCollection
 
-from sb3_por.errors import UserError
+from sb3_por.errors import UserError, one_line
 from sb3_por.evaluation import EVAL_SEED, Evaluation, Model, evaluation_episodes, make_evaluation_env, run_episodes
 from sb3_por.files import atomic_write, check_output
 from softbody_envs.registration import ENV_IDS
@@ -53,6 +54,8 @@ def film(
         evaluation = run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))
         # The last frame is of the episode that the vectorised environment began when the last one ended.
         frames = env.env_method("render")[0][:-1]
+    except gym.error.Error as error:
+        raise UserError(f"{env_id} draws no images: {one_line(error)}") from error
     finally:
         env.close()
     write_film(path, frames, fps)

@@ -10,6 +10,14 @@ import pandas as pd
 from sb3_por.errors import UserError
 from sb3_por.scores import RUN_KEYS
 
+#: Algorithms that see the state: a ceiling for those that see images, not a rival of theirs.
+STATE_ALGOS = ("sac",)
+
+
+def in_order(algos: Iterable[str]) -> list[str]:
+    """POR first, then its rivals, then what sees the state: the order of tables, figures, and sides of a comparison."""
+    return sorted(set(algos), key=lambda algo: (algo in STATE_ALGOS, "por" not in algo, algo))
+
 
 class Run(NamedTuple):
     """
@@ -45,7 +53,7 @@ class Grid:
 
     @property
     def algos(self) -> list[str]:
-        return sorted({run.algo for run in self.runs})
+        return in_order(run.algo for run in self.runs)
 
     @property
     def envs(self) -> list[str]:

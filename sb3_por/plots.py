@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_por.drawing import curve, interval, legend_below, looks, name_rows, one_panel, panels, steps_axis, style
-from sb3_por.statistics import in_order
+from sb3_por.grids import in_order
 
 LABELS = {
     "normalized_performance": "normalized performance",
@@ -18,8 +18,6 @@ LABELS = {
 }
 #: What a classifier that knows nothing has, its name, and the limits of the axis.
 CHANCE = {"por_loss": (math.log(2), "ln 2", (0, 1.05)), "por_accuracy": (0.5, "½", (0.3, 1.02))}
-
-BOOTSTRAP = "95 % stratified bootstrap interval"
 
 
 def draw_iqm(table: pd.DataFrame, metric: str) -> Figure:
@@ -35,11 +33,9 @@ def draw_iqm(table: pd.DataFrame, metric: str) -> Figure:
             where = f", {_count(rows['tasks'], 'task')}" if tasks > 1 else ""
             label = f"{algo} ({_count(rows['seeds'], 'seed')}{where})"
             curve(axes, rows["step"], rows["iqm"], rows["low"], rows["high"], by_algo[algo], label)
-        # The bootstrap draws runs within each task: one run a task leaves nothing to draw.
-        spread = "one seed, no interval" if _single(table) else BOOTSTRAP
-        over = ["seeds"] * (not _single(table)) + ["tasks"] * (tasks > 1)
+        over = [name for name, several in (("seeds", not _single(table)), ("tasks", tasks > 1)) if several]
         what = f"interquartile mean over {' and '.join(over)}, " if over else ""
-        axes.set_title(f"{', '.join(envs)}\n{what}{spread}")
+        axes.set_title(f"{', '.join(envs)}\n{what}{_interval_of(table)}")
         steps_axis(axes)
         axes.set_ylabel(LABELS[metric])
         axes.legend()
@@ -76,7 +72,7 @@ def draw_profiles(table: pd.DataFrame, metric: str) -> Figure:
             color, line, _ = by_algo[algo]
             axes.plot(rows["threshold"], rows["fraction"], label=label, color=color, linestyle=line, drawstyle="steps-post")
             axes.fill_between(rows["threshold"], rows["low"], rows["high"], color=color, alpha=0.15, linewidth=0, step="post")
-        axes.set_title(f"performance profile at step {_step(table)}, {'no interval' if _single(table) else BOOTSTRAP}")
+        axes.set_title(f"performance profile at step {_step(table)}, {_interval_of(table)}")
         axes.set_xlabel(f"{LABELS[metric]} τ")
         axes.set_ylabel("fraction of runs above τ")
         axes.set_ylim(-0.02, 1.04)
@@ -99,8 +95,7 @@ def draw_aggregates(table: pd.DataFrame, metric: str) -> Figure:
             name_rows(axes, [algo for algo, _ in algos])
             axes.set_title(f"{name} ({'lower' if name == 'optimality gap' else 'higher'} is better)")
             axes.set_xlabel(LABELS[metric])
-        what = "one seed, no interval" if _single(table) else BOOTSTRAP
-        figure.suptitle(f"all tasks at step {_step(table)}, {what}", fontsize=11, x=0.01, ha="left")
+        figure.suptitle(f"all tasks at step {_step(table)}, {_interval_of(table)}", fontsize=11, x=0.01, ha="left")
     return figure
 
 
@@ -117,7 +112,8 @@ def draw_improvements(table: pd.DataFrame, metric: str) -> Figure:
         name_rows(axes, [f"{row.algo} over {row.rival}" for row in table.itertuples()])
         axes.axvline(0.5, color="0.4", linewidth=1)
         axes.set_xlim(-0.03, 1.03)
-        axes.set_title(f"probability of improvement at step {_step(table)}, 95 % interval")
+        axes.set_xticks([0, 0.25, 0.5, 0.75, 1])
+        axes.set_title(f"probability of improvement at step {_step(table)}, {_interval_of(table)}")
         axes.set_xlabel(f"how likely a run of the first has the higher {LABELS[metric]}")
     return figure
 
@@ -138,7 +134,7 @@ def draw_ratios(table: pd.DataFrame, metric: str) -> Figure:
             axes.axvline(1, color="0.4", linewidth=1)
             axes.set_title(env)
             axes.set_xlabel(f"ratio at step {_step(rows)}")
-        title = f"mean {LABELS[metric]} : the best rival's, 95 % bootstrap interval"
+        title = f"mean {LABELS[metric]} : the best rival's, {_interval_of(table)}"
         figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     return figure
 
@@ -171,7 +167,7 @@ def draw_order(table: pd.DataFrame) -> Figure:
 
 
 def _algos(table: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    return [(algo, table[table["algo"] == algo]) for algo in in_order(list(table["algo"].unique()))]
+    return [(algo, table[table["algo"] == algo]) for algo in in_order(table["algo"])]
 
 
 def _count(column: pd.Series, noun: str) -> str:
@@ -182,6 +178,11 @@ def _count(column: pd.Series, noun: str) -> str:
 
 def _single(table: pd.DataFrame) -> bool:
     return bool(table["seeds"].max() == 1)
+
+
+def _interval_of(table: pd.DataFrame) -> str:
+    # The bootstrap draws runs within each task: one run a task leaves nothing to draw.
+    return "one seed, no interval" if _single(table) else "95 % stratified bootstrap interval"
 
 
 def _spread(table: pd.DataFrame) -> str:

@@ -9,15 +9,13 @@ import pandas as pd
 from rliable import library as rly
 from scipy.stats import trim_mean
 
-from sb3_por.grids import Grid, read_grid
+from sb3_por.grids import STATE_ALGOS, Grid, read_grid
 from sb3_por.order_logs import ORDER_METRICS
 
 #: Bootstrap samples.
 REPS = 2000
 #: Metrics whose best value is 1, which is what an optimality gap is measured from.
 UNIT_METRICS = ("normalized_performance", "success")
-#: Algorithms that see the state: a ceiling for those that see images, not a rival of theirs.
-STATE_ALGOS = ("sac",)
 #: Thresholds of a performance profile.
 N_THRESHOLDS = 101
 
@@ -151,11 +149,12 @@ def improvements(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     """
     Probability of improvement of each pair of algorithms at the last step that all runs have.
 
-    :return: columns algo, rival, probability (that algo beats rival), low, high, step, tasks; no rows for one algorithm
+    :return: columns algo, rival, probability (that algo beats rival), low, high, step, seeds (of the one that has fewer),
+        tasks; no rows for one algorithm
     """
     step, matrices = grid.last()
-    pairs = list(combinations(in_order(grid.algos), 2))
-    columns = ["algo", "rival", "probability", "low", "high", "step", "tasks"]
+    pairs = list(combinations(grid.algos, 2))
+    columns = ["algo", "rival", "probability", "low", "high", "step", "seeds", "tasks"]
     if not pairs:
         grid.note(f"there is one algorithm only ({grid.algos[0]}): no probability of improvement")
         return pd.DataFrame(columns=columns)
@@ -165,8 +164,8 @@ def improvements(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
         return np.array([probability_of_improvement(of[x], of[y]) for x, y in pairs])
 
     value, low, high = _interval(list(matrices.values()), measure, reps, seed)
-    n_tasks = next(iter(matrices.values())).shape[1]
-    rows = [(*pair, *numbers, step, n_tasks) for pair, *numbers in zip(pairs, value, low, high, strict=True)]
+    shapes = [np.minimum(matrices[x].shape, matrices[y].shape) for x, y in pairs]
+    rows = [(*pair, *numbers, step, *shape) for pair, shape, *numbers in zip(pairs, shapes, value, low, high, strict=True)]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -179,7 +178,7 @@ def ratios(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     :return: columns env, algo, score, rival, rival_score, ratio, low, high, step, seeds; NaN or infinite where the rival's
         mean is not positive
     """
-    algos = [algo for algo in in_order(grid.algos) if algo not in STATE_ALGOS]
+    algos = [algo for algo in grid.algos if algo not in STATE_ALGOS]
     if set(grid.algos) - set(algos):
         grid.note(f"{' and '.join(STATE_ALGOS)} sees the state, so it is nobody's rival in the ratios")
     rows = []
@@ -201,11 +200,6 @@ def ratios(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
                 grid.note(f"{env}: rivals of {algo} score 0 or less, at least in some samples, where no ratio is finite")
     columns = ["env", "algo", "score", "rival", "rival_score", "ratio", "low", "high", "step", "seeds"]
     return pd.DataFrame(rows, columns=columns)
-
-
-def in_order(algos: list[str]) -> list[str]:
-    """POR first, then its rivals, then what sees the state: the order of tables and of the two sides of a comparison."""
-    return sorted(algos, key=lambda algo: (algo in STATE_ALGOS, "por" not in algo, algo))
 
 
 def _best_rival(means: np.ndarray, i: int) -> int:

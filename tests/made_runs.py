@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import yaml
+from torch.utils.tensorboard import SummaryWriter
 
 from sb3_por.scores import COLUMNS
 
@@ -26,6 +27,14 @@ def write_run(folder, algo="sac_por", env="PourWater-v0", seed=1, performance=(0
         wall_clock_s=np.array(steps) / 10,
     )
     return run
+
+
+def log_order(run, losses, folder="SACPOR_1", first_step=100):
+    """TensorBoard files as a run of POR writes them."""
+    with SummaryWriter(run / "tb" / folder) as writer:
+        for i, loss in enumerate(losses):
+            writer.add_scalar("train/por_loss", loss, first_step + 100 * i)
+            writer.add_scalar("train/por_accuracy", 1 - loss, first_step + 100 * i)
 
 
 def table(algo, env, seed, performance, steps=STEPS):

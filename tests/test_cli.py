@@ -62,6 +62,18 @@ def test_enjoy_writes_a_film_and_says_where(run, tmp_path, capsys):
     assert imageio.mimread(path)[0].shape[:2] == (48, 48)
 
 
+def test_enjoy_says_what_an_environment_needs_to_draw(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    assert main(["enjoy", "--model", str(run), "--env", "Pendulum-v1", "-o", str(tmp_path / "film.gif")]) == 2
+    assert "error: Pendulum-v1 draws no images: pygame is not installed" in capsys.readouterr().err
+
+
+def test_report_writes_a_page_and_says_where(run, tmp_path, capsys):
+    assert main(["report", str(run), "-o", str(tmp_path / "page"), "--no-films"]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'page' / 'index.html'}\n"
+    assert "Pendulum-v1" in (tmp_path / "page" / "index.html").read_text()
+
+
 def test_plot_draws_a_run_and_its_table_draws_the_same(run, tmp_path, capsys):
     first, second, csv = tmp_path / "curve.png", tmp_path / "again.png", tmp_path / "scores.csv"
     assert main(["plot", str(run), "-o", str(first), "--csv", str(csv)]) == 0
@@ -83,7 +95,7 @@ def test_plot_draws_every_figure_into_a_folder(run, tmp_path, capsys):
     shown = capsys.readouterr()
     names = {path.name for path in (tmp_path / "figures").iterdir()}
     assert {"iqm.png", "iqm.pdf", "iqm.csv", "tasks.png", "profile.pdf", "aggregates.csv"} <= names
-    assert "note: no figure improvement: there is one algorithm only (sac)" in shown.err
+    assert "note: there is one algorithm only (sac): no probability of improvement" in shown.err
     assert main(["plot", str(run), "--step", "150", "-o", str(tmp_path / "numbers.csv")]) == 0
     assert (tmp_path / "numbers.csv").read_text().splitlines()[-1] == "sac,150,0.35,0.35,0.35,1,1,Pendulum-v1"
 
@@ -106,6 +118,8 @@ def test_plot_draws_every_figure_into_a_folder(run, tmp_path, capsys):
         (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "film.avi"], "must end in .gif or .mp4"),
         (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "/proc/film.gif"], "cannot write in /proc"),
         (["plot", "nowhere", "-o", "curve.png"], "there is no folder nowhere"),
+        (["report", "nowhere", "-o", "page"], "there is no folder nowhere"),
+        (["report", "none.csv", "-o", "page"], "cannot read none.csv"),
         (["plot", "RUN", "-o", "curve.txt"], "must end in .png or .pdf or .svg"),
         (["plot", "RUN", "-o", "curve.png", "--kind", "curves"], "invalid choice: 'curves'"),
         (["plot", "RUN", "-o", "curve.png", "--kind", "ratio"], "no two algorithms that learn from images"),

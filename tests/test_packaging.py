@@ -78,7 +78,7 @@ def test_constraints_pin_what_is_declared_within_its_range(options):
         assert pin.operator == "==" and requirement.specifier.contains(pin.version), name
 
 
-def test_a_wheel_holds_the_hyperparameters_and_finds_them(tmp_path, options):
+def test_a_wheel_holds_the_hyperparameters_and_the_page_and_finds_them(tmp_path, options):
     """Installed without -e, away from the checkout."""
     source = tmp_path / "source"
     files = subprocess.run(
@@ -95,6 +95,7 @@ def test_a_wheel_holds_the_hyperparameters_and_finds_them(tmp_path, options):
         archive.extractall(tmp_path / "installed")
     installed = {path.name for path in (tmp_path / "installed" / "sb3_por" / "zoo_hyperparams").glob("*.yml")}
     assert installed == {path.name for path in (ROOT / "zoo_hyperparams").glob("*.yml")}
+    assert (tmp_path / "installed" / "sb3_por" / "report.html.jinja").is_file()
     script = "from sb3_por.zoo import hyperparameter_file as f; print(f('sac_por', 'PourWater-v0'))"
     shown = subprocess.run(
         [sys.executable, "-c", script],

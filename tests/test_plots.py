@@ -5,21 +5,12 @@ import time
 import numpy as np
 import pandas as pd
 import pytest
-from made_runs import random_scores, table, write_run
-from torch.utils.tensorboard import SummaryWriter
+from made_runs import log_order, random_scores, table, write_run
 
 from sb3_por.drawing import KNOWN, looks
 from sb3_por.errors import UserError
 from sb3_por.figures import KINDS, plot, plot_all, plot_order, save_all
 from sb3_por.order_logs import find_order, read_order, write_order
-
-
-def log_order(run, losses, folder="SACPOR_1", first_step=100):
-    """TensorBoard files as a run of POR writes them."""
-    with SummaryWriter(run / "tb" / folder) as writer:
-        for i, loss in enumerate(losses):
-            writer.add_scalar("train/por_loss", loss, first_step + 100 * i)
-            writer.add_scalar("train/por_accuracy", 1 - loss, first_step + 100 * i)
 
 
 def texts(figure):
@@ -96,7 +87,11 @@ def test_a_figure_of_nothing_is_refused_and_left_out_of_all():
             plot(alone, kind)
     plots, notes = plot_all(alone, reps=20)
     assert [one.name for one in plots] == ["iqm", "tasks", "aggregates", "profile"]
-    assert any(note.startswith("no figure improvement: ") for note in notes)
+    assert any("no probability of improvement" in note for note in notes) and any("no ratio" in note for note in notes)
+    apart = pd.concat([random_scores(algos=("a",), envs=("T",)), random_scores(algos=("b",), envs=("U",))])
+    plots, notes = plot_all(apart, reps=20)
+    assert [one.name for one in plots] == ["iqm", "tasks"]
+    assert any(note.startswith("no figure profile: no environment was run with every algorithm") for note in notes)
 
 
 def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):

@@ -144,6 +144,7 @@ def cluster(tmp_path):
     # A token of its own: without one, anybody who reaches the port may run programs. Ray's sockets want a short path.
     folder = tempfile.mkdtemp(prefix="ray_", dir="/tmp")
     env = os.environ | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "TMPDIR": folder}
+    env["RAY_worker_niceness"] = "0"  # 15 by default, which on a busy machine takes long
     command = [
         sys.executable,
         "-m",
@@ -164,13 +165,28 @@ def cluster(tmp_path):
             wait_for(lambda log=log: "Ray runtime started" in log.read_text(), 90)
         yield f"127.0.0.1:{port}", env, nodes
     finally:
-        left = [process for node in nodes for process in descendants(node)]
-        for node in reversed(nodes):
-            node.terminate()
-            node.wait(30)
-        for process in psutil.wait_procs(left, timeout=10)[1]:
+        left = [process for node in nodes for process in [*descendants(node), node]]
+        for process in left:
             process.kill()
+        for process in left:
+            process.wait(10)
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def start(cluster):
+    """Starts a program with the environment variables of the cluster; it does not outlive the test."""
+    started = []
+
+    def popen(command):
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        started.append(subprocess.Popen(command, cwd=ROOT, env=cluster[1], **pipes))
+        return started[-1]
+
+    yield popen
+    for process in started:
+        process.kill()
+        process.communicate()
 
 
 def descendants(process):
@@ -202,23 +218,29 @@ def training_below(node):
 @needs_ray
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_suite_outlives_a_worker_and_a_node_of_its_cluster(tmp_path, cluster):
-    address, env, (head, other) = cluster
+def test_a_suite_outlives_a_worker_and_a_node_of_its_cluster(tmp_path, cluster, start):
+    address, _, (head, other) = cluster
     path, root = tmp_path / "grid.yml", tmp_path / "runs" / "grid"
     command = [sys.executable, "-m", "sb3_por", "suite", path, "--root", root.parent, "--ray", address]
 
     path.write_text(GRID + "gpus: 1\n")
-    refused = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
-    assert refused.returncode == 2 and "no machine of the Ray cluster has 1 CPUs and 1 GPUs" in refused.stderr
+    refused = start(command)
+    assert "no machine of the Ray cluster has 1 CPUs and 1 GPUs" in refused.communicate()[1] and refused.returncode == 2
 
     path.write_text(GRID)
-    suite = subprocess.Popen(command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    stopped = start([*command, "--root", tmp_path / "stopped"])
+    wait_for(lambda: training_below(head), 240)
+    stopped.terminate()
+    assert "interrupted; the same command goes on" in stopped.communicate()[1] and stopped.returncode == 130
+    wait_for(lambda: training_below(head) is None and training_below(other) is None, 20)
+
+    suite = start(command)
     lost = []
     for node, victim in ((head, "worker"), (other, "node")):
-        wait_for(lambda node=node: suite.poll() is not None or training_below(node), 120)
+        wait_for(lambda node=node: training_below(node), 240)
         worker, seed = training_below(node)
         run = Run("sac", "Pendulum-v1", seed, root / "Pendulum-v1" / "sac" / f"seed_{seed}", ())
-        wait_for(lambda run=run: latest_checkpoint(run.run_folder), 120)
+        wait_for(lambda run=run: latest_checkpoint(run.run_folder), 240)
         for process in [worker] if victim == "worker" else [*descendants(node), psutil.Process(node.pid)]:
             process.send_signal(signal.SIGKILL)
         lost.append(run)

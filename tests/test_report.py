@@ -78,7 +78,8 @@ def suite(tmp_path_factory):
             (run / ENV / "config.yml").write_text(yaml.safe_dump({"batch_size": 64, "n_timesteps": 300.0}))
             (folder / "log.txt").write_text("one line\n")
             (run / f"{ENV}.zip").touch()
-        model_of[algo]().save(root / ENV / algo / "seed_0" / algo / f"{ENV}_0" / "best_model.zip")
+        for seed in (0, 1):
+            model_of[algo]().save(root / ENV / algo / f"seed_{seed}" / algo / f"{ENV}_{seed}" / "best_model.zip")
     log_order(root / ENV / "sac_por" / "seed_0" / "sac_por" / f"{ENV}_0", [0.7, 0.5])
     stopped = root / ENV / "sac" / "seed_1"
     (stopped / "sac" / f"{ENV}_1" / f"{ENV}.zip").unlink()

@@ -6,7 +6,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch as th
 from gymnasium import spaces
@@ -25,8 +25,13 @@ from sb3_por.replay import SequenceReplayBuffer
 from sb3_por.rng import get_rng_state, set_rng_state
 from sb3_por.views import Views, take_rows
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm as Algorithm
+else:
+    Algorithm = ABC
 
-class VisualActorCritic(ABC):
+
+class VisualActorCritic(Algorithm):
     """
     A mixin for SB3's off-policy actor-critics (SAC, TQC). It takes their arguments, in their order, and the keyword
     arguments below; ``VisualSAC`` documents all of them.
@@ -53,10 +58,24 @@ class VisualActorCritic(ABC):
         ``"reduce-overhead"`` (CUDA graphs); None for none
     """
 
+    # What SAC and TQC have in common
+    policy: Any
+    actor: Any
+    critic: Any
+    critic_target: Any
+    replay_buffer: Any
+    ent_coef_optimizer: Any
+    log_ent_coef: Any
+    ent_coef_tensor: th.Tensor
+    target_entropy: Any
+    target_update_interval: int
+    batch_norm_stats: list[th.Tensor]
+    batch_norm_stats_target: list[th.Tensor]
+
     def __init__(
         self,
         policy: Any,
-        env: GymEnv | str | None,
+        env: GymEnv | str,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 100_000,
         learning_starts: int = 100,
@@ -230,7 +249,7 @@ class VisualActorCritic(ABC):
         """Mixed precision for the forward passes of an update, if asked for."""
         return th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bfloat16")
 
-    def _encoder_losses(self, replay_data: Any, views: Views, ent_coef: th.Tensor) -> tuple[th.Tensor, th.Tensor | float]:
+    def _encoder_losses(self, replay_data: Any, views: Views, ent_coef: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """L_RL and lambda * L_objective: the two losses that train the encoder."""
         for name in self._next_names():
             # All rows at once, before the objective asks for some of them
@@ -243,7 +262,7 @@ class VisualActorCritic(ABC):
             target = self.reward_scale * replay_data.rewards
             target = target + (1 - replay_data.dones) * discounts * sum(next_values) / len(next_values)
         critic_losses = [self._critic_loss(views.online(name), replay_data.actions, target) for name in self._obs_names()]
-        return sum(critic_losses) / len(critic_losses), objective_loss
+        return th.stack(critic_losses).mean(), objective_loss
 
     def _sample(self, batch_size: int) -> Any:
         """A batch from the replay buffer with what the objective asks for."""
@@ -284,6 +303,7 @@ class VisualActorCritic(ABC):
 
     def _prepare(self, observations: Any) -> Any:
         """Augment and preprocess one set of observations."""
+        augmented: Any
         if isinstance(observations, dict):
             augmented = {
                 key: self._augment(value) if key in self._image_keys else value for key, value in observations.items()
@@ -292,11 +312,11 @@ class VisualActorCritic(ABC):
             augmented = self._augment(observations) if self._image_keys else observations
         return self.policy.preprocess(augmented)
 
-    def _objective_loss(self, views: Views) -> th.Tensor | float:
+    def _objective_loss(self, views: Views) -> th.Tensor:
         """The objective's weighted loss."""
         objective = self.policy.objective
         if objective is None:
-            return 0.0
+            return th.zeros((), device=self.device)
         loss, metrics = objective.loss(views)
         self._log_objective(metrics)
         return self.objective_coef * loss
@@ -344,7 +364,7 @@ class VisualActorCritic(ABC):
         # Copy running stats, see SB3 #996
         polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
-    def _diagnose(self, replay_data: Any, critic_loss: th.Tensor, objective_loss: th.Tensor | float) -> None:
+    def _diagnose(self, replay_data: Any, critic_loss: th.Tensor, objective_loss: th.Tensor) -> None:
         """Now and then: the objective's control, and how hard each loss pulls at the encoder."""
         objective = self.policy.objective
         if objective is None or self._n_updates % self.diagnostics_interval != 0:
@@ -354,7 +374,7 @@ class VisualActorCritic(ABC):
         with th.no_grad():
             self._log_objective(objective.control(self._control_views(replay_data)))
 
-    def _encoder_grad_norms(self, critic_loss: th.Tensor, objective_loss: th.Tensor | float) -> dict[str, th.Tensor]:
+    def _encoder_grad_norms(self, critic_loss: th.Tensor, objective_loss: th.Tensor) -> dict[str, th.Tensor]:
         """How hard each loss pulls at the encoder; keeps the graph."""
         parameters = self.critic.encoder_parameters()
         norms = {}

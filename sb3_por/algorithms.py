@@ -1,14 +1,19 @@
 """The algorithms that users choose from: a visual actor-critic and an objective each."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_por.actor_critic import VisualActorCritic
 from sb3_por.objectives import Contrastive, Objective, PartialOrder, SelfPredictive
 from sb3_por.visual_sac import VisualSAC
 from sb3_por.visual_tqc import VisualTQC
 
+if TYPE_CHECKING:
+    Mixed = VisualActorCritic  # what the mixins below are mixed into
+else:
+    Mixed = object
 
-class ReferenceSettings:
+
+class ReferenceSettings(Mixed):
     """
     Defaults of the references, CURL and DrQ, where they differ from SB3's. A mixin; all of it can be set.
 

@@ -130,10 +130,11 @@ def diagnose(model: Any, env_id: str, n_episodes: int = 5, seed: int = 0, vec_no
 def _play(model: Any, env: VecEnv, episodes: list[Any], at_random: bool) -> tuple[SequenceReplayBuffer, list[float]]:
     """The transitions of these episodes, and each one's correlation of potential and monotone quantity."""
     env.env_method("play", episodes)
-    observation = env.reset()
+    observation: Any = env.reset()
     monotone = [env.unwrapped.reset_infos[0].get("monotone", np.nan)]
     frames = [observation]
-    transitions, correlations = [], []
+    transitions: list[Any] = []
+    correlations: list[float] = []
     while len(correlations) < len(episodes):
         action = np.array([env.action_space.sample()]) if at_random else model.predict(observation, deterministic=True)[0]
         next_observation, reward, done, infos = env.step(action)

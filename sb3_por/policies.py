@@ -1,7 +1,7 @@
 """Policies whose critic owns the encoder; the actor sees the detached trunk through a projection of its own."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch as th
 from sb3_contrib.tqc.policies import Critic as QuantileCritic
@@ -35,7 +35,7 @@ class VisualActor(Actor):
         if not self.use_sde:
             # Exploration starts with a standard deviation of about 1, as in SB3, not in the middle of the range, e^-4
             middle, half_range = 0.5 * (LOG_STD_MAX + LOG_STD_MIN), 0.5 * (LOG_STD_MAX - LOG_STD_MIN)
-            nn.init.constant_(self.log_std.bias, math.atanh(-middle / half_range))
+            nn.init.constant_(self.log_std.bias, math.atanh(-middle / half_range))  # type: ignore[attr-defined]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "detach_trunk": self.detach_trunk}
@@ -82,6 +82,12 @@ class VisualActor(Actor):
             for name, parameter in self.named_parameters()
             if not (self.detach_trunk and name.startswith("features_extractor"))
         ]
+
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import BasePolicy as Policy
+else:
+    Policy = object
 
 
 class EncoderOwner:
@@ -154,7 +160,7 @@ class VisualQuantileCritic(EncoderOwner, QuantileCritic):
         return th.stack([q_network(q_input) for q_network in self.q_networks], dim=1)
 
 
-class VisualPolicy:
+class VisualPolicy(Policy):
     """
     What the visual policies of SAC and TQC have in common. A mixin for SB3's policies; takes their arguments, with the
     encoder as default features extractor, and
@@ -165,8 +171,15 @@ class VisualPolicy:
     :param objective_kwargs: Keyword arguments of the objective
     """
 
-    critic_class: type[nn.Module]
+    critic_class: type[Any]
     default_encoder: type[Encoder]
+    # What SAC's and TQC's policies have in common
+    actor: Any
+    critic: Any
+    critic_target: Any
+    actor_kwargs: dict[str, Any]
+    critic_kwargs: dict[str, Any]
+    share_features_extractor: bool
 
     def __init__(
         self,
@@ -223,13 +236,13 @@ class VisualPolicy:
         if self.objective is not None:
             trained_with_critic += [parameter for parameter in self.objective.parameters() if parameter.requires_grad]
         for network, parameters in ((self.critic, trained_with_critic), (self.actor, self.actor.own_parameters())):
-            network.optimizer = self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)
+            network.optimizer = self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
-    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> VisualActor:
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         return VisualActor(**actor_kwargs, detach_trunk=features_extractor is not None).to(self.device)
 
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> nn.Module:
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         return self.critic_class(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -77,7 +77,7 @@ class ExpertModel:
 REFERENCES = {"random": RandomModel, "nothing": IdleModel, "expert": ExpertModel}
 
 
-def _spaces(env_id: str) -> tuple[gym.Space, gym.Space]:
+def _spaces(env_id: str) -> tuple[gym.Space, Any]:
     try:
         kwargs: dict[str, Any] = {"obs_type": "state"} if env_id in ENV_IDS else {}
         env = gym.make(env_id, **kwargs)

@@ -168,7 +168,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         # A space that is not a Dict is a Dict with one entry in here
         self.is_dict = isinstance(observation_space, spaces.Dict)
         self._spaces = dict(observation_space.spaces) if self.is_dict else {"": observation_space}  # type: ignore[attr-defined]
-        self._shapes = dict(self.obs_shape) if self.is_dict else {"": self.obs_shape}  # type: ignore[call-overload]
+        self._shapes: dict[str, Any] = dict(self.obs_shape) if self.is_dict else {"": self.obs_shape}  # type: ignore[arg-type]
         n_ring = self.buffer_size * n_envs
         storage_device = self._choose_storage(storage, n_ring)
         self._frames = {
@@ -191,7 +191,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
     def _choose_storage(self, storage: str, n_frames: int) -> th.device:
         if storage not in ("auto", "cpu", "cuda"):
             raise ValueError(f"storage must be 'auto', 'cpu' or 'cuda', not {storage!r}.")
-        frame_bytes = sum(int(np.prod(shape)) * self._spaces[key].dtype.itemsize for key, shape in self._shapes.items())  # type: ignore[union-attr]
+        frame_bytes = sum(int(np.prod(shape)) * self._spaces[key].dtype.itemsize for key, shape in self._shapes.items())  # type: ignore[misc,union-attr]
         needed = n_frames * (frame_bytes + self.action_dim * 4 + 21)
         if storage != "cpu" and self.device.type == "cuda":
             free = th.cuda.mem_get_info(self.device)[0]

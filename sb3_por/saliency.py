@@ -77,14 +77,15 @@ def draw_saliency(
     :return: the step that was drawn
     :raises UserError: if the model learns no order from images, or there is no such step
     """
-    k = check_order(model).future[1]
+    _, k = check_order(model).future or (1, 1)
     path = check_output(path, FORMATS)
     if not isinstance(model.observation_space, spaces.Box) or len(model.observation_space.shape) != 3:
         raise UserError(f"a saliency map needs a model that sees images alone, not {model.observation_space}")
     env = make_evaluation_env(model, env_id, vec_normalize=vec_normalize)
     try:
         env.env_method("play", evaluation_episodes(env_id, 1, seed))
-        observation, done = env.reset(), False
+        observation: Any = env.reset()
+        done = False
         frames, monotone = [observation[0]], [env.unwrapped.reset_infos[0].get("monotone", 0.0)]
         while not done:
             observation, _, dones, infos = env.step(model.predict(observation, deterministic=True)[0])

@@ -73,7 +73,7 @@ class VisualSAC(VisualActorCritic, SAC):
         return q_values.min(dim=1, keepdim=True).values - entropy_term
 
     def _critic_loss(self, features: th.Tensor, actions: th.Tensor, target: th.Tensor) -> th.Tensor:
-        return 0.5 * sum(F.mse_loss(q_values, target) for q_values in self.critic.q_values(features, actions))
+        return 0.5 * th.stack([F.mse_loss(q_values, target) for q_values in self.critic.q_values(features, actions)]).sum()
 
     def _actor_values(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         return th.cat(self.critic.q_values(features, actions), dim=1).min(dim=1, keepdim=True).values

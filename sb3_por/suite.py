@@ -11,7 +11,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
+from rich.table import Column, Table
 
 from sb3_por.errors import UserError
 from sb3_por.pools import LocalPool, Pool
@@ -105,7 +105,7 @@ def _name_failed(pool: Pool) -> int:
 
 def progress_table(pool: Pool) -> Table:
     """Of each run its state, steps, steps a second, latest score and the time left; below, the same of the suite."""
-    table = Table("run", "state", "steps", "steps/s", "score", "time left")
+    table = Table(Column("run", overflow="fold"), "state", "steps", "steps/s", "score", "time left")
     speeds, left = [], 0
     for run in pool.runs:
         steps, score = pool.progress(run)
@@ -124,9 +124,9 @@ def progress_table(pool: Pool) -> Table:
             _duration((total - steps) / speed) if speed and total else "",
         )
     finished = sum(state == "finished" for state in pool.states.values())
-    table.caption = f"{finished} of {len(pool.runs)} runs finished, {sum(speeds):.0f} steps/s"
-    if speeds and left:
-        table.caption += f", {_duration(left / sum(speeds))} left"
+    table.caption = f"{finished} of {len(pool.runs)} runs finished"
+    if speeds:
+        table.caption += f", {sum(speeds):.0f} steps/s, {_duration(left / sum(speeds))} left"
     return table
 
 

@@ -251,7 +251,7 @@ def test_the_table_shows_steps_speed_score_and_time_left(suite_file, tmp_path, f
     run = pool.runs[0]
     run.run_folder.mkdir(parents=True)
     (run.run_folder / "0.monitor.csv").write_text("#\nr,l,t\n" + "0,100,1\n" * 4)
-    np.savez(run.run_folder / "evaluations.npz", timesteps=[200], normalized_performance=[[0.25, 0.75]])
+    np.savez(run.run_folder / "evaluations.npz", timesteps=[200], results=[[1, 3]], normalized_performance=[[0.25, 0.75]])
     pool.states[run], pool.started[run] = "running", (time.monotonic() - 10, 200)
     console = Console(file=io.StringIO(), width=120)
     console.print(progress_table(pool))

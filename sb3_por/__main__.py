@@ -120,8 +120,10 @@ def _plot(args: argparse.Namespace) -> None:
     if args.csv:
         check_output(args.csv, (".csv",))
     if args.kind == figures.ORDER:
+        if args.step is not None:
+            raise UserError(f"--step is where scores are compared; --kind {figures.ORDER} shows all of training")
         order = read_order(args.paths)
-        plot, notes = figures.plot_order(order, args.step)
+        plot, notes = figures.plot_order(order)
         plot.save(args.output)
     else:
         scores = read_scores(args.paths)

@@ -103,13 +103,12 @@ def _plot(grid: Grid, kind: str, reps: int, seed: int) -> Plot | None:
     return None if table.empty else Plot(kind, KINDS[kind].title, table, KINDS[kind].draw(table, grid.metric))
 
 
-def plot_order(order: pd.DataFrame, step: int | None = None) -> tuple[Plot, list[str]]:
+def plot_order(order: pd.DataFrame) -> tuple[Plot, list[str]]:
     """
     :param order: of :func:`sb3_por.order_logs.read_order`
-    :param step: see :func:`sb3_por.grids.read_grid`
     :return: the figure, and what was left out
     """
-    table, notes = statistics.order_curves(order, step)
+    table, notes = statistics.order_curves(order)
     return Plot(ORDER, ORDER_TITLE, table, plots.draw_order(table)), notes
 
 
@@ -132,18 +131,18 @@ def plot_all(
     :raises UserError: if nothing of the metric is recorded, or no run reaches the step
     """
     grid = read_grid(scores, metric, step)
-    plots = []
+    drawn = []
     for kind in KINDS:
         try:
-            plots.append(_plot(grid, kind, reps, seed))
+            drawn.append(_plot(grid, kind, reps, seed))
         except UserError as error:
             grid.note(f"no figure {kind}: {error}")
     notes = grid.notes
     if order is not None:
-        figure, left_out = plot_order(order, step)
-        plots.append(figure)
+        figure, left_out = plot_order(order)
+        drawn.append(figure)
         notes = [*notes, *left_out]
-    return [one for one in plots if one is not None], notes
+    return [one for one in drawn if one is not None], notes
 
 
 def save_all(plots: list[Plot], folder: str | Path) -> None:

@@ -4,6 +4,7 @@ import os
 import platform
 import re
 import subprocess
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import torch as th
 import yaml
 from filelock import FileLock, Timeout
 
-from sb3_por.errors import UserError
+from sb3_por.errors import UserError, one_line
 from sb3_por.files import atomic_write
 
 EVALUATIONS = "evaluations.npz"
@@ -82,11 +83,26 @@ def progress(run: Path) -> tuple[int, float | None]:
         steps += sum(int(row[1]) for row in rows if len(row) > 2)
     score = None
     if (run / EVALUATIONS).is_file():
-        with np.load(run / EVALUATIONS) as file:
-            steps = max(steps, int(file["timesteps"][-1]))
-            latest = float(np.mean(file["normalized_performance"][-1])) if "normalized_performance" in file else np.nan
+        arrays = read_evaluations(run)
+        steps = max(steps, int(arrays["timesteps"][-1]))
+        latest = float(np.mean(arrays.get("normalized_performance", np.full((1, 1), np.nan))[-1]))
         score = None if np.isnan(latest) else latest
     return steps, score
+
+
+def read_evaluations(run: Path) -> dict[str, np.ndarray]:
+    """
+    :param run: a run folder
+    :return: the arrays in its ``evaluations.npz``, ``timesteps`` and ``results`` among them
+    :raises UserError: if it cannot be read
+    """
+    try:
+        with np.load(run / EVALUATIONS) as file:
+            arrays = {name: file[name] for name in file.files}
+        arrays["timesteps"], arrays["results"]
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise UserError(f"cannot read {run / EVALUATIONS}: {one_line(error)}") from error
+    return arrays
 
 
 def find_runs(paths: Iterable[str | Path]) -> list[Path]:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from sb3_por.errors import UserError, one_line
 from sb3_por.files import atomic_write
-from sb3_por.runs import EVALUATIONS, find_runs, run_arguments
+from sb3_por.runs import find_runs, read_evaluations, run_arguments
 
 #: What identifies a run, and what an evaluation measures.
 RUN_KEYS = ["env", "algo", "seed"]
@@ -51,19 +51,15 @@ def read_run(run: Path) -> pd.DataFrame:
     :return: its rows of the table of scores; means over the episodes of each evaluation
     :raises UserError: if its evaluations cannot be read
     """
-    try:
-        with np.load(run / EVALUATIONS) as file:
-            arrays = {name: file[name] for name in file.files}
-        steps, returns = arrays["timesteps"], arrays["results"].mean(axis=1)
-    except (OSError, EOFError, KeyError, ValueError) as error:
-        raise UserError(f"cannot read {run / EVALUATIONS}: {one_line(error)}") from error
+    arrays = read_evaluations(run)
+    steps = arrays["timesteps"]
     unknown = np.full(len(steps), np.nan)
     return pd.DataFrame(
         {
             **run_identity(run),
             "step": steps.astype(int),
             "normalized_performance": _episode_mean(arrays, "normalized_performance", unknown),
-            "return": returns,
+            "return": arrays["results"].mean(axis=1),
             "success": _episode_mean(arrays, "successes", unknown),
             "wall_clock_s": arrays.get("wall_clock_s", unknown),
             "commit": run_arguments(run).get("commit", ""),

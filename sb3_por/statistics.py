@@ -68,22 +68,21 @@ def task_curves(grid: Grid) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def order_curves(order: pd.DataFrame, step: int | None = None) -> tuple[pd.DataFrame, list[str]]:
+def order_curves(order: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     """
     Loss and accuracy of the partial-order classifier and of its control, mean and standard deviation over seeds, as in the
     paper's Figures 5 and 6.
 
     :param order: of :func:`sb3_por.order_logs.read_order`
-    :param step: as :func:`sb3_por.grids.read_grid` takes it
     :return: columns of :func:`task_curves` and metric, one of ``ORDER_METRICS``; and what was left out
     """
     tables, notes = [], []
     for metric in ORDER_METRICS:
         logged = order.dropna(subset=[metric])  # the control is logged less often
         if len(logged):
-            grid = read_grid(logged, metric, step)
+            grid = read_grid(logged, metric)
             tables.append(task_curves(grid).assign(metric=metric))
-            notes += grid.notes
+            notes += [f"POR's logs: {note}" for note in grid.notes]
     return pd.concat(tables, ignore_index=True), list(dict.fromkeys(notes))
 
 

@@ -71,7 +71,8 @@ def test_enjoy_says_what_an_environment_needs_to_draw(run, tmp_path, monkeypatch
 def test_report_writes_a_page_and_says_where(run, tmp_path, capsys):
     assert main(["report", str(run), "-o", str(tmp_path / "page"), "--no-films"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'page' / 'index.html'}\n"
-    assert "Pendulum-v1" in (tmp_path / "page" / "index.html").read_text()
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert "Pendulum-v1" in page and 'id="films"' not in page and "not everything can be shown of its model" not in page
 
 
 def test_plot_draws_a_run_and_its_table_draws_the_same(run, tmp_path, capsys):
@@ -124,6 +125,7 @@ def test_plot_draws_every_figure_into_a_folder(run, tmp_path, capsys):
         (["plot", "RUN", "-o", "curve.png", "--kind", "curves"], "invalid choice: 'curves'"),
         (["plot", "RUN", "-o", "curve.png", "--kind", "ratio"], "no two algorithms that learn from images"),
         (["plot", "RUN", "-o", "curve.png", "--kind", "order"], "no run has logged a POR loss"),
+        (["plot", "RUN", "-o", "curve.png", "--kind", "order", "--step", "9"], "--kind order shows all of training"),
         (["plot", "RUN", "-o", "curve.png", "--step", "500"], "no run was evaluated at step 500"),
     ],
 )

@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 import gymnasium as gym
 import pytest
 import yaml
+from filelock import FileLock
 from made_runs import log_order, random_scores, write_run
 from PIL import Image
 from stable_baselines3 import SAC
@@ -18,6 +19,7 @@ from stable_baselines3 import SAC
 from sb3_por import SACPOR
 from sb3_por.errors import UserError
 from sb3_por.grids import read_grid
+from sb3_por.inventory import take_inventory
 from sb3_por.report import write_report
 from sb3_por.scores import read_scores, write_csv
 from sb3_por.statistics import aggregates, improvements
@@ -167,7 +169,15 @@ def test_a_corrupt_model_is_noted_and_the_page_written(tmp_path):
     (run / "best_model.zip").write_bytes(b"PK nonsense")
     page = Page(write_report([run], tmp_path / "page"))
     assert "not everything can be shown of its model" in page.source and "is corrupt" in page.source
-    assert "is corrupt" not in Page(write_report([run], tmp_path / "page", films=False)).source
+
+
+def test_a_run_at_work_is_no_failure_yet(tmp_path):
+    run = write_run(tmp_path)
+    with FileLock(run / ".lock"):
+        assert take_inventory([tmp_path])[0].state == "running"
+    assert take_inventory([tmp_path])[0].state == "stopped"
+    (run / "PourWater-v0.zip").touch()
+    assert take_inventory([tmp_path])[0].state == "finished"
 
 
 def test_a_page_of_nothing_is_refused(tmp_path):

@@ -55,6 +55,8 @@ def test_bad_scores_are_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "evaluations.npz").write_bytes(b"PK nonsense")
+    cut_off = write_run(tmp_path / "cut") / "evaluations.npz"
+    cut_off.write_bytes(cut_off.read_bytes()[:500])
     (tmp_path / "column.csv").write_text("env,algo\na,b\n")
     (tmp_path / "words.csv").write_text("env,algo,seed,step\na,b,one,2\n")
     write_run(tmp_path / "once", seed=1)
@@ -63,6 +65,7 @@ def test_bad_scores_are_refused(tmp_path):
         ("nowhere",): "there is no folder",
         ("empty",): "no run under",
         ("broken",): "cannot read",
+        ("cut",): "cannot read",
         ("column.csv",): "has no column seed, step",
         ("words.csv",): "column seed must hold integers",
         ("missing.csv",): "cannot read",

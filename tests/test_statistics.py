@@ -211,6 +211,9 @@ def test_order_curves_have_each_metric_where_it_was_logged():
     assert loss["mean"].tolist() == pytest.approx([0.7, 0.5, 0.3]) and loss["std"].tolist() == pytest.approx([0, 0.1, 0.2])
     assert leak["step"].tolist() == [200, 300] and set(curves["metric"]) == {"por_loss", "por_accuracy", "por_leak_loss"}
     assert notes == []
+    assert order_curves(pd.concat([order[order["seed"] == 0], order[order["seed"] == 1].iloc[:2]]))[1][0] == (
+        "POR's logs: sac_por on T: the runs differ in length, so it ends with the shortest at step 200 (sac_por on T, seed 1)"
+    )
 
 
 def test_an_iqm_of_five_tasks_five_seeds_fifty_evaluations_is_quick():

@@ -105,7 +105,7 @@ def draw_improvements(table: pd.DataFrame, metric: str) -> Figure:
     """
     by_algo = looks(table["algo"])
     with style():
-        figure = Figure(figsize=(7, 0.4 * len(table) + 1.5), layout="constrained")
+        figure = Figure(figsize=(7, 0.4 * len(table) + 1.7), layout="constrained")
         axes = figure.add_subplot()
         for i, row in enumerate(table.itertuples()):
             interval(axes, i, row.probability, row.low, row.high, by_algo[row.algo])
@@ -113,7 +113,7 @@ def draw_improvements(table: pd.DataFrame, metric: str) -> Figure:
         axes.axvline(0.5, color="0.4", linewidth=1)
         axes.set_xlim(-0.03, 1.03)
         axes.set_xticks([0, 0.25, 0.5, 0.75, 1])
-        axes.set_title(f"probability of improvement at step {_step(table)}, {_interval_of(table)}")
+        axes.set_title(f"probability of improvement at step {_step(table)}\n{_interval_of(table)}")
         axes.set_xlabel(f"how likely a run of the first has the higher {LABELS[metric]}")
     return figure
 

@@ -24,7 +24,7 @@ from sb3_por.order_logs import find_order
 from sb3_por.plots import LABELS
 from sb3_por.runs import EVALUATIONS
 from sb3_por.saliency import draw_saliency
-from sb3_por.scores import METRICS, join_runs, read_csv, read_run
+from sb3_por.scores import METRICS, RUN_KEYS, join_runs, read_csv, read_run
 
 PAGE = "index.html"
 FIGURES = "figures"
@@ -117,6 +117,7 @@ def write_report(
     page = _template().render(
         title=", ".join((path.parent if path.suffix == ".csv" else path).resolve().name for path in given),
         metric=LABELS.get(metric or "", ""),
+        n_runs=len({(run.env, run.algo, run.seed) for run in runs} | _identities(scores)),
         n_scores=0 if scores is None else len(scores),
         runs=[_run_row(run, scores, metric) for run in runs],
         commits=sorted({run.commit for run in runs} | (set() if scores is None else set(scores["commit"])) - {""}),
@@ -143,6 +144,10 @@ def _evaluated(runs: list[RunFacts]) -> list[RunFacts]:
 def _scores(tables: list[Path], runs: list[RunFacts]) -> pd.DataFrame | None:
     rows = [read_csv(path) for path in tables] + [read_run(run.folder) for run in _evaluated(runs)]
     return join_runs(rows) if rows else None
+
+
+def _identities(scores: pd.DataFrame | None) -> set[tuple[str, str, int]]:
+    return set() if scores is None else set(scores[RUN_KEYS].itertuples(index=False, name=None))
 
 
 def _template() -> jinja2.Template:

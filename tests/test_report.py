@@ -129,7 +129,7 @@ def test_the_page_says_what_was_run(page):
 
 
 def test_the_page_shows_what_failed(page):
-    assert "2 did not finish" in page.source
+    assert "<p>4 runs, 12 evaluations." in page.source and "2 did not finish" in page.source
     assert f"sac on {ENV}, seed 1: stopped at step 300 of 300" in page.source
     assert "line 99\nKilled: &lt;b&gt;out of memory&lt;/b&gt;" in page.source and "line 10\n" not in page.source
     assert "seed_2/log.txt: failed before it began" in page.source and "error: no such setting" in page.source
@@ -153,7 +153,7 @@ def test_a_table_of_scores_makes_a_page_that_says_what_is_missing(tmp_path):
     write_csv(random_scores(algos=("sac_por", "sac_drq"), n_seeds=2), tmp_path / "scores.csv")
     page = Page(write_report([tmp_path / "scores.csv"], tmp_path / "page"))
     assert {"iqm", "tasks", "aggregates", "improvement", "ratio"} == set(page.tables) and "runs" not in page.tables
-    assert "made from scores alone" in page.source
+    assert "made from scores alone" in page.source and "<p>8 runs, 24 evaluations." in page.source
 
 
 def test_a_page_of_runs_that_were_never_evaluated_names_their_failures(tmp_path):

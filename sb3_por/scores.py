@@ -91,6 +91,8 @@ def read_csv(path: Path) -> pd.DataFrame:
     missing = [column for column in [*RUN_KEYS, "step"] if column not in scores]
     if missing:
         raise UserError(f"{path} has no column {', '.join(missing)}; a table of scores has {','.join(COLUMNS)}")
+    if scores.empty:
+        raise UserError(f"{path} holds no scores")
     scores = scores.reindex(columns=COLUMNS)
     scores["commit"] = scores["commit"].fillna("")
     for column in ("seed", "step"):

@@ -58,6 +58,7 @@ def test_bad_scores_are_refused(tmp_path):
     cut_off = write_run(tmp_path / "cut") / "evaluations.npz"
     cut_off.write_bytes(cut_off.read_bytes()[:500])
     (tmp_path / "column.csv").write_text("env,algo\na,b\n")
+    (tmp_path / "header.csv").write_text("env,algo,seed,step\n")
     (tmp_path / "words.csv").write_text("env,algo,seed,step\na,b,one,2\n")
     write_run(tmp_path / "once", seed=1)
     write_run(tmp_path / "twice", seed=1)
@@ -67,6 +68,7 @@ def test_bad_scores_are_refused(tmp_path):
         ("broken",): "cannot read",
         ("cut",): "cannot read",
         ("column.csv",): "has no column seed, step",
+        ("header.csv",): "holds no scores",
         ("words.csv",): "column seed must hold integers",
         ("missing.csv",): "cannot read",
         ("once", "twice"): "two runs of sac_por on PourWater-v0 with seed 1",

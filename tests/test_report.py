@@ -129,7 +129,7 @@ def test_the_page_says_what_was_run(page):
 
 
 def test_the_page_shows_what_failed(page):
-    assert "<p>4 runs, 12 evaluations." in page.source and "2 did not finish" in page.source
+    assert "<p>4 runs, 12 evaluations." in page.source and "2 not finished" in page.source
     assert f"sac on {ENV}, seed 1: stopped at step 300 of 300" in page.source
     assert "line 99\nKilled: &lt;b&gt;out of memory&lt;/b&gt;" in page.source and "line 10\n" not in page.source
     assert "seed_2/log.txt: failed before it began" in page.source and "error: no such setting" in page.source

@@ -77,10 +77,11 @@ def test_a_checkpoint_that_is_replaced_while_it_is_read_is_read_again(runs, monk
     read_bytes = Path.read_bytes
 
     def read_and_replace(path):
+        content = read_bytes(path)
         if path.parent == first:
             monkeypatch.undo()
             first.rename(second)
-        return read_bytes(path)
+        return content
 
     monkeypatch.setattr(Path, "read_bytes", read_and_replace)
     write_changes(copy, read_changes(run, {}))

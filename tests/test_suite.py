@@ -129,7 +129,7 @@ os.makedirs(checkpoint, exist_ok=True)
 begin = max([0, *(int(name[5:]) for name in os.listdir(checkpoint))])
 with open(f"{run}/0.monitor.csv", "a") as monitor:
     for step in range(begin + 1, 11):
-        time.sleep(0.1)
+        time.sleep(0.2)
         print(step, os.getpid(), flush=True)
         monitor.write("#\\nr,l,t\\n" * (step == 1) + f"0,1,{step}\\n")
         monitor.flush()
@@ -173,12 +173,12 @@ def wait_for(condition, seconds=30):
 
 
 def kill_suite(pid, workers_first):
-    """SIGKILL to a suite, with its workers or alone; its workers do not outlive it."""
+    """SIGKILL to a suite, with its workers or alone; its workers do not outlive it (they would work on for longer)."""
     suite = psutil.Process(pid)
     workers = suite.children(recursive=True)
     for process in [*workers, suite] if workers_first else [suite]:
         process.kill()
-    assert not psutil.wait_procs(workers, timeout=10)[1]
+    assert not psutil.wait_procs(workers, timeout=1)[1]
 
 
 def checkpoints_of(root):

@@ -178,7 +178,14 @@ def kill_suite(pid, workers_first):
     workers = suite.children(recursive=True)
     for process in [*workers, suite] if workers_first else [suite]:
         process.kill()
-    assert not psutil.wait_procs(workers, timeout=1)[1]
+    wait_for(lambda: all(map(has_ended, workers)), 1)
+
+
+def has_ended(process):
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
 
 
 def checkpoints_of(root):
@@ -216,7 +223,7 @@ def test_an_asked_for_stop_leaves_runs_that_go_on(start_suite, tmp_path, capfd):
     os.kill(process.pid, signal.SIGTERM)
     process.join()
     assert process.exitcode == 130 and "interrupted; the same command goes on" in capfd.readouterr().err
-    assert not psutil.wait_procs(workers, timeout=10)[1]
+    wait_for(lambda: all(map(has_ended, workers)), 10)
     process = start_suite(FAKE_SUITE)
     process.join()
     assert process.exitcode == 0

@@ -172,13 +172,13 @@ def wait_for(condition, seconds=30):
         time.sleep(0.02)
 
 
-def kill_suite(pid, workers_first):
+def kill_suite(pid, workers_first, within):
     """SIGKILL to a suite, with its workers or alone; its workers do not outlive it (they would work on for longer)."""
     suite = psutil.Process(pid)
     workers = suite.children(recursive=True)
     for process in [*workers, suite] if workers_first else [suite]:
         process.kill()
-    wait_for(lambda: all(map(has_ended, workers)), 1)
+    wait_for(lambda: all(map(has_ended, workers)), within)
 
 
 def has_ended(process):
@@ -199,7 +199,7 @@ def test_a_killed_suite_takes_its_workers_along_and_goes_on(start_suite, tmp_pat
         before = checkpoints_of(tmp_path)
         wait_for(lambda before=before: checkpoints_of(tmp_path) != before)
         time.sleep(rng.uniform(0, 0.3))
-        kill_suite(process.pid, workers_first)
+        kill_suite(process.pid, workers_first, 1)
         process.join()
         assert process.exitcode == -signal.SIGKILL
     process = start_suite(FAKE_SUITE)
@@ -313,7 +313,7 @@ def test_a_suite_of_six_runs_killed_twice_ends_like_an_uninterrupted_one(suite_f
         before = checkpoints_of(root)
         wait_for(lambda before=before: checkpoints_of(root) != before, 120)
         time.sleep(rng.uniform(0, 4))
-        kill_suite(process.pid, workers_first)
+        kill_suite(process.pid, workers_first, 10)
         process.communicate()
         assert process.returncode == -signal.SIGKILL
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

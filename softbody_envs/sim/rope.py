@@ -41,7 +41,8 @@ class Rope:
         self._world = world
         client = world.client
         # Much damping, for a segment that spins fast leaves its joints in one step; stiff joints pull it back at once.
-        client.setPhysicsEngineParameter(numSolverIterations=10, erp=1.0)
+        # Neighbours are 7 mm apart: from Bullet's 2 cm on, each would be a contact that never touches.
+        client.setPhysicsEngineParameter(numSolverIterations=10, erp=1.0, contactBreakingThreshold=0.004)
         shape = client.createCollisionShape(pybullet.GEOM_SPHERE, radius=RADIUS)
         look, end_look = (
             client.createVisualShape(pybullet.GEOM_CAPSULE, radius=RADIUS, length=SPACING, rgbaColor=color)

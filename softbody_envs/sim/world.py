@@ -41,6 +41,7 @@ class World:
         self.floor: Floor | None = None
         with quiet():
             self.client = BulletClient(pybullet.DIRECT)
+        self._step = self.client.stepSimulation  # the client looks its methods up at every call
 
     def clear(self) -> None:
         """Remove every body and set all settings again: ``resetSimulation`` forgets some of them and keeps others."""
@@ -54,7 +55,7 @@ class World:
 
     def step(self) -> None:
         """Advance by ``time_step`` seconds."""
-        self.client.stepSimulation()
+        self._step()
 
     def close(self) -> None:
         """Disconnect; closing twice does nothing."""

@@ -39,11 +39,14 @@ from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kw
 from sb3_por.files import atomic_write, check_writable, remove_unfinished
 from sb3_por.loading import model_file, read_data
 from sb3_por.runs import current_commit, current_machine, read_settings, run_arguments, write_settings
+from sb3_por.search_spaces import sampler
 
 EXAMPLE = """example:
   python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:0.1 pairing:paper
 
   python train.py --resume logs/sac_por/PourWater-v0_1
+
+  python train.py --algo sac_por --env PourWater-v0 -n 20000 -optimize --n-trials 50 --study-name pour --storage tuning.log
 
 Settings come from zoo_hyperparams/<algo>.yml, else from the RL Zoo's file of the algorithm. The run goes to
 <log-folder>/<algo>/<env>_<n>: best_model.zip, evaluations.npz, checkpoints, tb/ for TensorBoard."""
@@ -53,8 +56,8 @@ DEFAULTS = {"algo": "sac_por", "env": "PourWater-v0", "eval_freq": 2000, "save_f
 
 for _name, _class in ALGORITHMS.items():
     ALGOS[_name] = _class
-    _base = "tqc" if _name.startswith("tqc") else "sac"
-    HYPERPARAMS_SAMPLER[_name], HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_SAMPLER[_base], HYPERPARAMS_CONVERTER[_base]
+    # A trial's parameters are the algorithm's arguments.
+    HYPERPARAMS_SAMPLER[_name], HYPERPARAMS_CONVERTER[_name] = sampler(_name), dict
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,0 +1,82 @@
+"""What ``train.py -optimize`` tries: the settings that all visual algorithms share, and those of each objective."""
+
+from collections.abc import Callable
+from typing import Any
+
+import optuna
+
+from sb3_por.objectives.por import ORDER_HEADS, PAIRINGS
+
+Space = Callable[[optuna.Trial], dict[str, Any]]
+
+
+def common(trial: optuna.Trial) -> dict[str, Any]:
+    """
+    :return: learning rate, discount factor, moving averages of Q networks and encoder
+    """
+    return {
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 2e-3, log=True),
+        "gamma": trial.suggest_categorical("gamma", [0.95, 0.97, 0.98, 0.99]),
+        "tau": trial.suggest_float("tau", 0.005, 0.05, log=True),
+        "encoder_tau": trial.suggest_float("encoder_tau", 0.01, 0.1, log=True),
+    }
+
+
+def partial_order(trial: optuna.Trial) -> dict[str, Any]:
+    """
+    :return: lambda, m (of 50 features), k, pairing and head of the partial-order objective
+    """
+    return {
+        "por_coef": trial.suggest_float("por_coef", 0.01, 1.0, log=True),
+        "order_dim": trial.suggest_categorical("order_dim", [1, 5, 10, 25, 40]),
+        "k": trial.suggest_int("k", 1, 5),
+        "random_k": trial.suggest_categorical("random_k", [False, True]),
+        "pairing": trial.suggest_categorical("pairing", list(PAIRINGS)),
+        "order_head": trial.suggest_categorical("order_head", list(ORDER_HEADS)),
+    }
+
+
+def augmentations(trial: optuna.Trial) -> dict[str, Any]:
+    """
+    :return: DrQ's K and M
+    """
+    return {
+        "n_augmentations": trial.suggest_int("n_augmentations", 1, 3),
+        "n_target_augmentations": trial.suggest_int("n_target_augmentations", 1, 3),
+    }
+
+
+def contrastive(trial: optuna.Trial) -> dict[str, Any]:
+    """
+    :return: weight of CURL's loss
+    """
+    return {"curl_coef": trial.suggest_float("curl_coef", 0.01, 1.0, log=True)}
+
+
+def self_predictive(trial: optuna.Trial) -> dict[str, Any]:
+    """
+    :return: weight and horizon of SPR's loss
+    """
+    return {
+        "spr_coef": trial.suggest_float("spr_coef", 0.01, 2.0, log=True),
+        "horizon": trial.suggest_int("horizon", 1, 5),
+    }
+
+
+#: The part of the search space that belongs to each algorithm.
+SEARCH_SPACES: dict[str, Space] = {
+    "sac_por": partial_order,
+    "tqc_por": partial_order,
+    "sac_drq": augmentations,
+    "sac_curl": contrastive,
+    "sac_spr": self_predictive,
+}
+
+
+def sampler(algo: str) -> Callable[..., dict[str, Any]]:
+    """
+    :param algo: a name of ``SEARCH_SPACES``
+    :return: a function from an Optuna trial (the zoo's other arguments change nothing) to arguments of the algorithm,
+        which have the trial's names
+    """
+    return lambda trial, *_: common(trial) | SEARCH_SPACES[algo](trial)

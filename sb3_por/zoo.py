@@ -57,7 +57,7 @@ DEFAULTS = {"algo": "sac_por", "env": "PourWater-v0", "eval_freq": 2000, "save_f
 for _name, _class in ALGORITHMS.items():
     ALGOS[_name] = _class
     # A trial's parameters are the algorithm's arguments.
-    HYPERPARAMS_SAMPLER[_name], HYPERPARAMS_CONVERTER[_name] = sampler(_name), lambda parameters: parameters
+    HYPERPARAMS_SAMPLER[_name], HYPERPARAMS_CONVERTER[_name] = sampler(_name), dict  # type: ignore[assignment]
 
 
 def main(arguments: list[str] | None = None) -> int:

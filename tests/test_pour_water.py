@@ -11,6 +11,8 @@ from softbody_envs.sim.water import DIAMETER, RADIUS, Water
 from softbody_envs.sim.world import World
 from softbody_envs.tasks.pour_water import MARGIN, REACH, SINK_DEPTH
 
+#: For the long form of a test: minutes.
+SOAK = (pytest.mark.slow, pytest.mark.timeout(3000))
 WATER_ENVS = [env_id for env_id in softbody_envs.ENV_IDS if env_id.startswith("PourWater")]
 
 
@@ -67,19 +69,19 @@ def play(env, episodes, act, first_variation=0):
     return violations, scores
 
 
-@pytest.mark.parametrize("episodes", [3, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("episodes", [3, pytest.param(200, marks=SOAK)])
 def test_no_particle_passes_a_wall_in_random_play(episodes):
     env = make()
     rng = np.random.default_rng(0)
     assert play(env, episodes, lambda: rng.uniform(-1, 1, 3))[0] == 0
 
 
-@pytest.mark.parametrize("episodes", [3, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("episodes", [3, pytest.param(200, marks=SOAK)])
 def test_no_particle_passes_a_wall_when_the_expert_pours(episodes):
     assert play(make(), episodes, make_expert("PourWater-v0"))[0] == 0
 
 
-@pytest.mark.parametrize("episodes", [6, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("episodes", [6, pytest.param(50, marks=SOAK)])
 @pytest.mark.parametrize("env_id", WATER_ENVS)
 def test_expert_reaches_its_score_on_held_out_variations(env_id, episodes):
     _, scores = play(make(env_id), episodes, make_expert(env_id), first_variation=800)

@@ -9,6 +9,9 @@ from softbody_envs.sim import cloth
 from softbody_envs.sim.cloth import N_SIDE, TETHER
 from softbody_envs.tasks.fold_cloth import GRASP_RANGE, N_HALF, PICKER_RADIUS
 
+#: For the long form of a test: minutes.
+SOAK = (pytest.mark.slow, pytest.mark.timeout(3000))
+
 CLOTH_ENVS = ("FoldCloth-v0", "DropFoldCloth-v0")
 EXPERT_SCORES = {"FoldCloth-v0": 0.90, "DropFoldCloth-v0": 0.80}
 NOTHING = np.zeros(8)
@@ -43,7 +46,7 @@ def play_expert(env_id, variations):
     return np.array(scores), mean_stretch, max_stretch
 
 
-@pytest.mark.parametrize("episodes", [2, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("episodes", [2, pytest.param(50, marks=SOAK)])
 @pytest.mark.parametrize("env_id", CLOTH_ENVS)
 def test_expert_folds_without_stretching_the_cloth(env_id, episodes):
     scores, mean_stretch, max_stretch = play_expert(env_id, range(800, 800 + episodes))
@@ -53,7 +56,7 @@ def test_expert_folds_without_stretching_the_cloth(env_id, episodes):
     assert max_stretch <= 1.3
 
 
-@pytest.mark.parametrize("episodes", [2, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("episodes", [2, pytest.param(200, marks=SOAK)])
 @pytest.mark.parametrize("env_id", CLOTH_ENVS)
 def test_cloth_never_explodes_in_random_play(env_id, episodes):
     env, rng = make(env_id), np.random.default_rng(0)

@@ -5,7 +5,7 @@ Importing this module imports ``rl_zoo3``, which replaces Gymnasium's ``TimeLimi
 """
 
 import argparse
-import importlib
+import importlib.util
 import os
 import shutil
 import signal
@@ -119,6 +119,8 @@ class Parser(argparse.ArgumentParser):
         args = super().parse_args()
         if args.resume:
             return self._resumed(Path(args.resume))
+        if args.track and importlib.util.find_spec("wandb") is None:
+            raise UserError("--track needs Weights & Biases: pip install wandb")
         check_known("algorithm", args.algo, ALGOS)
         _import_packages(args.gym_packages)
         check_known("environment", args.env, gym.registry)

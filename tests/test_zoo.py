@@ -245,3 +245,9 @@ def test_settings_at_the_papers_scale_build_the_papers_encoder(algo):
     model = ALGORITHMS[algo](arguments.pop("policy"), env, **{**arguments, "buffer_size": 10})
     assert [conv.stride[0] for conv in model.critic.features_extractor.trunk if hasattr(conv, "stride")] == [2, 1, 1, 1]
     assert model.critic.projection.block_dims == [32 * 57 * 57]
+
+
+def test_tracking_without_its_package_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main([*PENDULUM, "--track"]) == 2
+    assert capsys.readouterr().err.strip() == "train.py: error: --track needs Weights & Biases: pip install wandb"

@@ -53,9 +53,9 @@ class WholeEncoder(BaseFeaturesExtractor):
 #: Name: class, its arguments, and the encoder passes that one update needs, in batches: with gradient, without. All need
 #: o_t with gradient for the critic, o_{t+1} from the momentum encoder for the target, and from the trunk for the actor.
 ALGORITHMS: dict[str, tuple[type[Any], dict[str, Any], tuple[float, float]]] = {
-    # Actor, critic and target encode for themselves: o_t twice with gradient (once for the actor's), o_{t+1} twice
-    # without; SB3 also encodes o_t once for the critic's judgement of the actor.
-    "sac (SB3)": (SAC, {"policy_kwargs": {"features_extractor_class": WholeEncoder}}, (2, 3)),
+    # Actor, critic and target encode for themselves. With gradient: o_t for the actor, for the critic, and for the
+    # critic's judgement of the actor, in which SB3 does not stop it. Without: o_{t+1} for the actor and for the target.
+    "sac (SB3)": (SAC, {"policy_kwargs": {"features_extractor_class": WholeEncoder}}, (3, 2)),
     "visual_sac": (VisualSAC, {}, (1, 2)),
     "sac_por": (SACPOR, {}, (1, 2.5)),  # half a batch of earlier frames passes the momentum encoder
     "sac_por (paper)": (SACPOR, {"pairing": "paper"}, (1, 2)),

@@ -6,7 +6,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
@@ -40,7 +40,7 @@ class VisualActorCritic(Algorithm):
     optimizer step over encoder, critic and objective; actor and temperature on the detached trunk features; moving
     averages last.
 
-    :param encoder_tau: tau of the momentum encoder; that of the Q networks (``tau``) by default
+    :param encoder_tau: tau of the momentum encoder; ``encoder_tau_ratio`` times that of the Q networks (``tau``) by default
     :param actor_update_interval: Update actor and temperature every that many updates
     :param target_update_interval: Update the target networks every that many updates (SB3 counts within one call of
         ``train()``, SB3 #2158)
@@ -58,6 +58,9 @@ class VisualActorCritic(Algorithm):
         ``"reduce-overhead"`` (CUDA graphs); None for none
     """
 
+    #: How much faster the momentum encoder follows than the Q networks, unless it is told.
+    encoder_tau_ratio: ClassVar[float] = 1.0
+
     # What SAC and TQC have in common
     policy: Any
     actor: Any
@@ -67,6 +70,7 @@ class VisualActorCritic(Algorithm):
     ent_coef_optimizer: Any
     log_ent_coef: Any
     ent_coef_tensor: th.Tensor
+    tau: float
     target_entropy: Any
     target_update_interval: int
     batch_norm_stats: list[th.Tensor]
@@ -97,7 +101,6 @@ class VisualActorCritic(Algorithm):
         check_precision(precision)
         self.precision = precision
         self.compile_mode = compile_mode
-        self.encoder_tau = encoder_tau
         self.actor_update_interval = actor_update_interval
         self.reward_scale = reward_scale
         self.augmentation_pad = augmentation_pad
@@ -110,6 +113,7 @@ class VisualActorCritic(Algorithm):
         self._metrics: dict[str, list[th.Tensor]] = defaultdict(list)
         kwargs["target_update_interval"] = target_update_interval
         super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, *args, **kwargs)
+        self.encoder_tau = min(self.encoder_tau_ratio * self.tau, 1.0) if encoder_tau is None else encoder_tau
 
     def _objective(self) -> tuple[type[Objective] | None, dict[str, Any]]:
         """
@@ -291,15 +295,19 @@ class VisualActorCritic(Algorithm):
         if objective is not None:
             future = getattr(replay_data, "future_observations", None)
             frames["future"] = frames["next"] if future is None else self._prepare(future)
-            if getattr(replay_data, "past_observations", None) is not None:
-                frames["past"] = self._prepare(_first_half(replay_data.past_observations))
-                data["past_gaps"] = _first_half(replay_data.past_gaps)
+            self._add_past(frames, data, replay_data, getattr(replay_data, "past_observations", None))
             if objective.positive:
                 frames["positive"] = self._prepare(replay_data.observations)
             if objective.window > 0:
                 frames["window"] = self._prepare(_flatten_window(replay_data.window_observations))
                 data.update(window_actions=replay_data.window_actions, window_mask=replay_data.window_mask)
         return Views(self.critic, self.critic_target, frames, data)
+
+    def _add_past(self, frames: dict[str, Any], data: dict[str, th.Tensor], replay_data: Any, past: Any) -> None:
+        """Add these earlier frames of the first half of the batch, if the replay buffer has any."""
+        if getattr(replay_data, "past_gaps", None) is not None:
+            frames["past"] = self._prepare(_first_half(past))
+            data["past_gaps"] = _first_half(replay_data.past_gaps)
 
     def _prepare(self, observations: Any) -> Any:
         """Augment and preprocess one set of observations."""
@@ -356,11 +364,10 @@ class VisualActorCritic(Algorithm):
 
     def _update_targets(self) -> None:
         """theta_m <- tau theta_o + (1 - tau) theta_m for encoder and Q networks, each with its tau."""
-        encoder_tau = self.tau if self.encoder_tau is None else self.encoder_tau
-        polyak_update(self.critic.encoder_parameters(), self.critic_target.encoder_parameters(), encoder_tau)
+        polyak_update(self.critic.encoder_parameters(), self.critic_target.encoder_parameters(), self.encoder_tau)
         polyak_update(self.critic.head_parameters(), self.critic_target.head_parameters(), self.tau)
         if self.policy.objective is not None:
-            self.policy.objective.update_momentum(encoder_tau)
+            self.policy.objective.update_momentum(self.encoder_tau)
         # Copy running stats, see SB3 #996
         polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
@@ -387,10 +394,8 @@ class VisualActorCritic(Algorithm):
     def _control_views(self, replay_data: Any) -> Views:
         """The observations in all places, augmented independently: what an objective's control is shown."""
         frames = {name: self._prepare(replay_data.observations) for name in ("obs", "future")}
-        data = {}
-        if getattr(replay_data, "past_observations", None) is not None:
-            frames["past"] = self._prepare(_first_half(replay_data.observations))
-            data["past_gaps"] = _first_half(replay_data.past_gaps)
+        data: dict[str, th.Tensor] = {}
+        self._add_past(frames, data, replay_data, replay_data.observations)
         return Views(self.critic, self.critic_target, frames, data)
 
     def _record_metrics(self) -> None:

@@ -1,6 +1,6 @@
 """The algorithms that users choose from: a visual actor-critic and an objective each."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from sb3_por.actor_critic import VisualActorCritic
 from sb3_por.objectives import Contrastive, Objective, PartialOrder, SelfPredictive
@@ -8,42 +8,16 @@ from sb3_por.visual_sac import VisualSAC
 from sb3_por.visual_tqc import VisualTQC
 
 if TYPE_CHECKING:
-    Mixed = VisualActorCritic  # what the mixins below are mixed into
+    Mixed = VisualActorCritic  # what the mixin below is mixed into
 else:
     Mixed = object
 
 
-class ReferenceSettings(Mixed):
-    """
-    Defaults of the references, CURL and DrQ, where they differ from SB3's. A mixin; all of it can be set.
-
-    :param actor_update_interval: Update actor and temperature every that many updates
-    :param target_update_interval: Update the target networks every that many updates
-    :param encoder_tau: Soft update coefficient of the momentum encoder f_m; five times ``tau`` by default, at most 1
-    :param tau: Soft update coefficient of the target Q networks
-    """
-
-    def __init__(
-        self,
-        *args: Any,
-        actor_update_interval: int = 2,
-        target_update_interval: int = 2,
-        encoder_tau: float | None = None,
-        tau: float = 0.01,
-        **kwargs: Any,
-    ):
-        encoder_tau = min(5 * tau, 1.0) if encoder_tau is None else encoder_tau
-        super().__init__(
-            *args,
-            actor_update_interval=actor_update_interval,
-            target_update_interval=target_update_interval,
-            encoder_tau=encoder_tau,
-            tau=tau,
-            **kwargs,
-        )
+#: CURL's, SPR's and the paper's momentum encoder: 0.05 where the Q networks have 0.01.
+MOMENTUM_TAU_RATIO = 5.0
 
 
-class WithPartialOrder(ReferenceSettings):
+class WithPartialOrder(Mixed):
     """
     Adds the POR objective to a visual actor-critic. A mixin; takes the arguments of the algorithm and
 
@@ -55,6 +29,8 @@ class WithPartialOrder(ReferenceSettings):
     :param k: Steps between the two frames of a pair
     :param random_k: Draw these steps from 1..k for each pair
     """
+
+    encoder_tau_ratio: ClassVar[float] = MOMENTUM_TAU_RATIO
 
     def __init__(
         self,
@@ -106,41 +82,27 @@ class TQCPOR(WithPartialOrder, VisualTQC):
     """
 
 
-class SACDrQ(ReferenceSettings, VisualSAC):
+class SACDrQ(VisualSAC):
     """
     DrQ (https://arxiv.org/abs/2004.13649): SAC from pixels with [K, M] random shifts and nothing else. Losses are
     averaged over the M augmentations; DrQ sums them, which Adam does not notice. Arguments: those of ``VisualSAC``.
 
     :param n_augmentations: DrQ's M
     :param n_target_augmentations: DrQ's K
-    :param encoder_tau: ``tau`` by default: DrQ has one for all
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        n_augmentations: int = 2,
-        n_target_augmentations: int = 2,
-        encoder_tau: float | None = None,
-        tau: float = 0.01,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            *args,
-            n_augmentations=n_augmentations,
-            n_target_augmentations=n_target_augmentations,
-            encoder_tau=tau if encoder_tau is None else encoder_tau,
-            tau=tau,
-            **kwargs,
-        )
+    def __init__(self, *args: Any, n_augmentations: int = 2, n_target_augmentations: int = 2, **kwargs: Any):
+        super().__init__(*args, n_augmentations=n_augmentations, n_target_augmentations=n_target_augmentations, **kwargs)
 
 
-class SACCURL(ReferenceSettings, VisualSAC):
+class SACCURL(VisualSAC):
     """
     CURL: SAC from pixels with a contrastive objective. Arguments: those of ``VisualSAC`` and
 
     :param curl_coef: Weight of the contrastive loss
     """
+
+    encoder_tau_ratio: ClassVar[float] = MOMENTUM_TAU_RATIO
 
     def __init__(self, *args: Any, curl_coef: float = 1.0, **kwargs: Any):
         self.curl_coef = curl_coef
@@ -154,13 +116,15 @@ class SACCURL(ReferenceSettings, VisualSAC):
         return self.curl_coef
 
 
-class SACSPR(ReferenceSettings, VisualSAC):
+class SACSPR(VisualSAC):
     """
     SPR: SAC from pixels with a self-predictive objective. Arguments: those of ``VisualSAC`` and
 
     :param spr_coef: Weight of the loss, which is summed over the steps
     :param horizon: Number K of steps to predict
     """
+
+    encoder_tau_ratio: ClassVar[float] = MOMENTUM_TAU_RATIO
 
     def __init__(self, *args: Any, spr_coef: float = 1.0, horizon: int = 5, **kwargs: Any):
         self.spr_coef = spr_coef

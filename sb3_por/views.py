@@ -29,8 +29,10 @@ class Views:
     :param critic: Owner of the online encoder: has ``trunk(observations)`` and ``projection(trunk_features)``
     :param critic_target: Owner of the momentum encoder
     :param frames: Preprocessed observations by name: ``"obs"`` (o_t), ``"next"`` (o_{t+1}), and what the objective
-        asks for: ``"future"`` (o_{t+k}), ``"positive"`` (another augmentation of o_t), ``"window"`` (o_{t+1..t+K})
-    :param data: Other tensors by name that the objective may use: ``"actions"``, ``"window_actions"``, ``"window_mask"``
+        asks for: ``"future"`` (o_{t+k}), ``"past"`` (o_{t-k}, for the first half of the batch), ``"positive"`` (another
+        augmentation of o_t), ``"window"`` (o_{t+1..t+K})
+    :param data: Other tensors by name that the objective may use: ``"actions"``, ``"past_gaps"``,
+        ``"window_actions"``, ``"window_mask"``
     """
 
     def __init__(self, critic: Any, critic_target: Any, frames: dict[str, Any], data: dict[str, th.Tensor] | None = None):

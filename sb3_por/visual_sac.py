@@ -45,7 +45,8 @@ class VisualSAC(VisualActorCritic, SAC):
     :param verbose: 0 for no output, 1 for info messages, 2 for debug messages
     :param seed: Seed of the random generators
     :param device: PyTorch device
-    :param encoder_tau: Soft update coefficient of the momentum encoder; that of the Q networks by default
+    :param encoder_tau: Soft update coefficient of the momentum encoder; ``encoder_tau_ratio`` times ``tau`` by default:
+        once for this class, 5 times (at most 1) where an objective learns from the momentum encoder
     :param actor_update_interval: Update actor and temperature every that many updates
     :param target_update_interval: Update the target networks every that many updates, counted over the whole training
     :param reward_scale: Factor on the rewards in the critic's target

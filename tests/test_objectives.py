@@ -156,7 +156,7 @@ def test_tqc_target_drops_the_top_quantiles():
 
 
 def test_momentum_projector_follows_the_projector():
-    model = make_model(SACSPR, target_update_interval=1).learn(21)
+    model = make_model(SACSPR, tau=0.01).learn(21)
     spr = model.policy.objective
     before = [p.clone() for p in spr.momentum_projector.parameters()]
     model.train(1, 8)
@@ -175,7 +175,7 @@ def test_weights_of_the_objectives_can_be_set(cls):
     assert make_model(cls, **{name: 0.3}).objective_coef == 0.3
 
 
-@pytest.mark.parametrize("name", [name for name in ALGORITHMS if name != "sac_por"])
+@pytest.mark.parametrize("name", ALGORITHMS)
 @pytest.mark.timeout(900)
 def test_every_algorithm_improves_from_pixels(name):
     env = DotEnv(size=20, falling=True)
@@ -193,7 +193,8 @@ def test_every_algorithm_improves_from_pixels(name):
         policy_kwargs=dict(net_arch=[32, 32], features_extractor_kwargs=dict(n_filters=8, strides=(2, 2))),
         **kwargs,
     )
+    before, _ = evaluate_policy(model, env, 10, warn=False)
     model.learn(700)
     after, _ = evaluate_policy(model, env, 10, warn=False)
     # Of 20; staying where the episode begins, as at random, gives 10 on average
-    assert after > 16.5
+    assert after > 16.5 > before

@@ -7,10 +7,9 @@ import pytest
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.evaluation import evaluate_policy
 from toy_envs import DotEnv
 
-from sb3_por import SACPOR, VisualSAC
+from sb3_por import SACPOR, SACDrQ, VisualSAC
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
@@ -59,7 +58,7 @@ def test_critic_loss_trains_the_encoder_and_actor_loss_leaves_no_gradient_there(
 
 
 def test_momentum_encoder_gets_no_gradient_and_follows_equation_3_exactly():
-    model = make_model(SACPOR, encoder_tau=0.05, tau=0.01, target_update_interval=1)
+    model = make_model(SACPOR, encoder_tau=0.05, tau=0.01)
     for _ in range(3):
         momentum, target_heads = snapshot(model.critic_target.encoder_parameters()), snapshot(
             model.critic_target.head_parameters()
@@ -87,7 +86,7 @@ def test_objective_and_critic_are_trained_by_one_loss_in_one_step():
 def test_weight_0_trains_as_without_objective():
     plain, weightless = make_model(n_collected=20), make_model(SACPOR, n_collected=20, por_coef=0.0, pairing="paper")
     for model in (plain, weightless):
-        model.encoder_tau, model.tau, model.actor_update_interval, model.target_update_interval = 0.05, 0.01, 2, 2
+        model.encoder_tau = 0.05
         th.manual_seed(0)
         np.random.seed(0)
         model.train(4, 8)
@@ -225,22 +224,14 @@ def test_is_an_sb3_sac():
     assert issubclass(SACPOR, SAC) and issubclass(VisualSAC, SAC)
 
 
-def test_learns_from_pixels():
-    env = DotEnv(falling=True)
-    model = SACPOR(
-        "CnnPolicy",
-        env,
-        learning_rate=1e-3,
-        buffer_size=2000,
-        learning_starts=100,
-        batch_size=16,
-        gamma=0.9,
-        ent_coef="auto_0.1",
-        augmentation_pad=1,
-        seed=0,
-        policy_kwargs=dict(net_arch=[32, 32], features_extractor_kwargs=dict(n_filters=8, strides=(2, 2, 2))),
-    )
-    before, _ = evaluate_policy(model, env, 10, warn=False)
-    model.learn(800)
-    after, _ = evaluate_policy(model, env, 10, warn=False)
-    assert after > 17 > before
+def test_takes_sb3s_arguments_in_sb3s_order():
+    model = SACPOR("CnnPolicy", DotEnv(), 1e-3, 1000, 50, 16, 0.02, 0.9, 2)
+    assert (model.learning_rate, model.buffer_size, model.batch_size, model.tau, model.gamma) == (1e-3, 1000, 16, 0.02, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("cls", "tau", "expected"), [(VisualSAC, 0.01, 0.01), (SACDrQ, 0.01, 0.01), (SACPOR, 0.01, 0.05), (SACPOR, 0.5, 1.0)]
+)
+def test_momentum_encoder_follows_tau_unless_told(cls, tau, expected):
+    assert make_model(cls, tau=tau).encoder_tau == pytest.approx(expected)
+    assert make_model(cls, tau=tau, encoder_tau=0.3).encoder_tau == 0.3

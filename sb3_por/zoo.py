@@ -222,7 +222,9 @@ class Experiment(ExperimentManager):
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         held_out = evaluation_kwargs(self.env_name.gym_id)
-        self.eval_env_kwargs = {**self.env_kwargs, **held_out, **(self._eval_env_kwargs_args or {})}
+        # Training episodes may be cut short (so that a picker that has gone astray starts again); what is scored is whole.
+        whole = {name: value for name, value in self.env_kwargs.items() if name != "max_episode_steps"}
+        self.eval_env_kwargs = {**whole, **held_out, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved
 
     def create_log_folder(self) -> None:

@@ -99,10 +99,10 @@ def test_env_kwargs_add_to_the_files_and_reach_the_evaluation(tmp_path, monkeypa
         gym.envs.registration.EnvSpec, "make", lambda spec, **kwargs: made.append(kwargs) or original(spec, **kwargs)
     )
     flags = ["--algo", "sac", "-n", "20", "--eval-freq", "20", "--eval-episodes", "1", "-f", str(tmp_path)]
-    assert main([*flags, "--env-kwargs", "renderer:tiny", "--seed", "1"]) == 0
+    assert main([*flags, "--env-kwargs", "renderer:tiny", "max_episode_steps:5", "--seed", "1"]) == 0
     train, held_out = sorted(made, key=lambda kwargs: "split" in kwargs)
-    assert train == {"obs_type": "state", "renderer": "tiny"}
-    assert held_out == {"obs_type": "state", "renderer": "tiny", "split": "eval"}
+    assert train == {"obs_type": "state", "renderer": "tiny", "max_episode_steps": 5}
+    assert held_out == {"obs_type": "state", "renderer": "tiny", "split": "eval"}  # whole episodes
     with np.load(tmp_path / "sac" / "PourWater-v0_1" / "evaluations.npz") as file:
         assert np.isfinite(file["normalized_performance"]).all() and file["successes"].shape == (1, 1)
 

@@ -79,7 +79,7 @@ class FoldClothExpert(ScriptedExpert):
                 if np.abs(goals - pickers(state)).max() < NEAR:
                     break
                 state = yield go(goals, state, pick=False)
-        while not state[18:].all():
+        while not state[18:20].all():
             state = yield go(pickers(state), state, pick=True)
 
         start, way = pickers(state), corners(state)[2:] - corners(state)[:2]

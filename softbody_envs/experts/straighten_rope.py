@@ -20,7 +20,7 @@ class StraightenRopeExpert:
         self._swapped: bool | None = None
 
     def act(self, state: np.ndarray) -> np.ndarray:
-        nodes, pickers, holds = state[:30].reshape(10, 3), state[30:36].reshape(2, 3), state[36:] > 0.5
+        nodes, pickers, holds = state[:30].reshape(10, 3), state[30:36].reshape(2, 3), state[36:38] > 0.5
         ends = nodes[[0, -1]]
         if self._swapped is None:
             straight, crossed = np.linalg.norm(pickers - ends), np.linalg.norm(pickers - ends[::-1])

@@ -56,7 +56,7 @@ class FoldClothEnv(SoftbodyEnv):
 
     ## Observation Space
 
-    `obs_type="pixels"`: an RGB image. `obs_type="state"`: `Box(-10, 10, (20,), float32)`:
+    `obs_type="pixels"`: an RGB image. `obs_type="state"`: `Box(-10, 10, (32,), float32)`:
 
     | Num | Observation | Unit |
     |-----|-------------|------|
@@ -64,6 +64,8 @@ class FoldClothEnv(SoftbodyEnv):
     | 6 to 11 | x, y, z of the corners where those belong, in the same order | m |
     | 12 to 17 | x, y, z of picker 0, then of picker 1 | m |
     | 18, 19 | whether picker 0, picker 1 holds the cloth | 0 or 1 |
+    | 20 to 25 | x, y, z of the corner of the edge to carry that each picker starts nearer to, seen from that picker | m |
+    | 26 to 31 | x, y, z of the corners where those belong, seen from them | m |
 
     ## Rewards
 
@@ -96,7 +98,7 @@ class FoldClothEnv(SoftbodyEnv):
       little further off.
     * Layers do not collide with each other: they lie in each other, and a perfect fold scores 1 but for what moved.
     * Pickers do not push the cloth, and they cannot tear it apart (SoftGym has a guard against that, switched off).
-    * The state also says which picker holds something.
+    * The state also says which picker holds something, where its corner is from it, and how far the corner has to go.
     * The cloth has no stripe of the other colour.
 
     ## Version History
@@ -110,6 +112,8 @@ class FoldClothEnv(SoftbodyEnv):
         *(f"corner {corner} {axis}" for corner in range(4) for axis in "xyz"),
         *(f"picker {picker} {axis}" for picker in range(2) for axis in "xyz"),
         *(f"picker {picker} holds" for picker in range(2)),
+        *(f"corner {corner} from picker {corner} {axis}" for corner in range(2) for axis in "xyz"),
+        *(f"corner {corner + 2} from corner {corner} {axis}" for corner in range(2) for axis in "xyz"),
     )
     best_performance: ClassVar[float] = 0.0
     success_threshold: ClassVar[float] = 0.9
@@ -158,7 +162,9 @@ class FoldClothEnv(SoftbodyEnv):
     def _measure(self) -> np.ndarray:
         corners = self._grid[[0, 0, -1, -1], [0, -1, 0, -1]]
         holds = [node is not None for node in self.pickers.held]
-        return np.concatenate([corners.ravel(), self.pickers.positions.ravel(), holds])
+        pickers = self.pickers.positions
+        ways = [corners[:2] - pickers, corners[2:] - corners[:2]]
+        return np.concatenate([corners.ravel(), pickers.ravel(), holds, *(way.ravel() for way in ways)])
 
     def performance(self) -> float:
         """Minus the mean distance between the halves, and minus that of the lower half from its place, weighted, m."""

@@ -50,13 +50,14 @@ class StraightenRopeEnv(SoftbodyEnv):
 
     ## Observation Space
 
-    `obs_type="pixels"`: an RGB image. `obs_type="state"`: `Box(-10, 10, (38,), float32)`:
+    `obs_type="pixels"`: an RGB image. `obs_type="state"`: `Box(-10, 10, (50,), float32)`:
 
     | Num | Observation | Unit |
     |-----|-------------|------|
     | 0 to 29 | x, y, z of the nodes 0, 2, 4, 6, 8, 10, 12, 14, 16 and 20 of 0..20; 0 and 20 are the ends | m |
     | 30 to 35 | x, y, z of the red picker, then of the green one | m |
     | 36, 37 | whether the red, the green picker holds the rope | 0 or 1 |
+    | 38 to 49 | x, y, z of node 0 and of node 20, seen from the red picker, then from the green one | m |
 
     ## Rewards
 
@@ -86,7 +87,8 @@ class StraightenRopeEnv(SoftbodyEnv):
     * `normalized_performance` is relative to the start, so that doing nothing scores 0. SoftGym divides by the length: an
       untouched rope scores well above 0 there.
     * The rope keeps its length within 5 %, whatever the pickers do. SoftGym's has 7.5 % of slack and can be stretched.
-    * 21 nodes instead of 41 particles; the state has the same ten of them, and says which picker holds something.
+    * 21 nodes instead of 41 particles; the state has the same ten of them, and says which picker holds something and
+      where the ends are from each picker: with positions alone, a learner remembers ropes instead of reaching for ends.
     * A start with its ends farther apart than 0.35 m, or under the rest of the rope, is drawn again: little would be left
       to do, or the image would not show what to do.
     * The ends are marked: in a heap of rope they look like bends.
@@ -105,6 +107,7 @@ class StraightenRopeEnv(SoftbodyEnv):
         *(f"picker {picker} {axis}" for picker in (0, 1) for axis in "xyz"),
         "picker 0 holds",
         "picker 1 holds",
+        *(f"end {end} from picker {picker} {axis}" for picker in (0, 1) for end in (0, 1) for axis in "xyz"),
     )
     best_performance: ClassVar[float] = 0.0
     success_threshold: ClassVar[float] = 0.9
@@ -125,7 +128,9 @@ class StraightenRopeEnv(SoftbodyEnv):
 
     def _measure(self) -> np.ndarray:
         holds = [float(node is not None) for node in self.pickers.held]
-        return np.concatenate([self._nodes[list(KEY_NODES)].ravel(), self.pickers.positions.ravel(), holds])
+        pickers = self.pickers.positions
+        reaches = self._nodes[[0, -1]] - pickers[:, None]
+        return np.concatenate([self._nodes[list(KEY_NODES)].ravel(), pickers.ravel(), holds, reaches.ravel()])
 
     def performance(self) -> float:
         """How far the distance between the ends is from the rope's length, m, negative."""

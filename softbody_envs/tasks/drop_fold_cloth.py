@@ -45,8 +45,8 @@ class DropFoldClothEnv(FoldClothEnv):
     | 6 to 11 | x, y, z of the lower corners, in the same order | m |
     | 12 to 17 | x, y, z of picker 0, then of picker 1 | m |
     | 18, 19 | whether picker 0, picker 1 holds the cloth | 0 or 1 |
-    | 20 to 25 | x, y, z of the upper corner of each picker, seen from that picker | m |
-    | 26 to 31 | x, y, z of the lower corners, seen from the upper ones | m |
+    | 20 to 25 | x, y, z of the upper corner of each picker, seen from that picker | 0.08 m |
+    | 26 to 31 | x, y, z of the lower corners, seen from the upper ones | 0.08 m |
 
     ## Rewards
 

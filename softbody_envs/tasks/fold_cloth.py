@@ -8,7 +8,7 @@ from softbody_envs.env import SoftbodyEnv
 from softbody_envs.painting import paint_sheet
 from softbody_envs.rendering import Camera
 from softbody_envs.sim.cloth import N_SIDE, STEPS_PER_CONTROL, Cloth, flat_grid
-from softbody_envs.sim.pickers import Pickers
+from softbody_envs.sim.pickers import REACH, Pickers
 from softbody_envs.sim.world import World
 
 #: Radius of the pickers, m, and how far from their centres a node may be to be taken: radius, threshold and radius of a
@@ -64,8 +64,8 @@ class FoldClothEnv(SoftbodyEnv):
     | 6 to 11 | x, y, z of the corners where those belong, in the same order | m |
     | 12 to 17 | x, y, z of picker 0, then of picker 1 | m |
     | 18, 19 | whether picker 0, picker 1 holds the cloth | 0 or 1 |
-    | 20 to 25 | x, y, z of the corner of the edge to carry that each picker starts nearer to, seen from that picker | m |
-    | 26 to 31 | x, y, z of the corners where those belong, seen from them | m |
+    | 20 to 25 | x, y, z of the corner of the edge to carry that each picker starts nearer to, seen from that picker | 0.08 m |
+    | 26 to 31 | x, y, z of the corners where those belong, seen from them | 0.08 m |
 
     ## Rewards
 
@@ -98,7 +98,8 @@ class FoldClothEnv(SoftbodyEnv):
       little further off.
     * Layers do not collide with each other: they lie in each other, and a perfect fold scores 1 but for what moved.
     * Pickers do not push the cloth, and they cannot tear it apart (SoftGym has a guard against that, switched off).
-    * The state also says which picker holds something, where its corner is from it, and how far the corner has to go.
+    * The state also says which picker holds something, where its corner is from it, and how far the
+      corner has to go, both in units of what a picker moves in one step.
     * The cloth has no stripe of the other colour.
 
     ## Version History
@@ -163,8 +164,8 @@ class FoldClothEnv(SoftbodyEnv):
         corners = self._grid[[0, 0, -1, -1], [0, -1, 0, -1]]
         holds = [node is not None for node in self.pickers.held]
         pickers = self.pickers.positions
-        ways = [corners[:2] - pickers, corners[2:] - corners[:2]]
-        return np.concatenate([corners.ravel(), pickers.ravel(), holds, *(way.ravel() for way in ways)])
+        ways = np.concatenate([corners[:2] - pickers, corners[2:] - corners[:2]]) / REACH
+        return np.concatenate([corners.ravel(), pickers.ravel(), holds, ways.ravel()])
 
     def performance(self) -> float:
         """Minus the mean distance between the halves, and minus that of the lower half from its place, weighted, m."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from softbody_envs.env import SoftbodyEnv
 from softbody_envs.rendering import Camera
-from softbody_envs.sim.pickers import Pickers
+from softbody_envs.sim.pickers import REACH, Pickers
 from softbody_envs.sim.rope import LENGTH, STEPS_PER_CONTROL, Rope, end_distance, failure
 from softbody_envs.sim.rope_bank import crumpled
 from softbody_envs.sim.world import World
@@ -57,7 +57,7 @@ class StraightenRopeEnv(SoftbodyEnv):
     | 0 to 29 | x, y, z of the nodes 0, 2, 4, 6, 8, 10, 12, 14, 16 and 20 of 0..20; 0 and 20 are the ends | m |
     | 30 to 35 | x, y, z of the red picker, then of the green one | m |
     | 36, 37 | whether the red, the green picker holds the rope | 0 or 1 |
-    | 38 to 49 | x, y, z of node 0 and of node 20, seen from the red picker, then from the green one | m |
+    | 38 to 49 | x, y, z of node 0 and of node 20, seen from the red picker, then from the green one | 0.08 m |
 
     ## Rewards
 
@@ -88,7 +88,8 @@ class StraightenRopeEnv(SoftbodyEnv):
       untouched rope scores well above 0 there.
     * The rope keeps its length within 5 %, whatever the pickers do. SoftGym's has 7.5 % of slack and can be stretched.
     * 21 nodes instead of 41 particles; the state has the same ten of them, and says which picker holds something and
-      where the ends are from each picker: with positions alone, a learner remembers ropes instead of reaching for ends.
+      where the ends are from each picker, in units of what it moves in one step: with positions alone a learner remembers
+      ropes instead of reaching for ends.
     * A start with its ends farther apart than 0.35 m, or under the rest of the rope, is drawn again: little would be left
       to do, or the image would not show what to do.
     * The ends are marked: in a heap of rope they look like bends.
@@ -129,7 +130,7 @@ class StraightenRopeEnv(SoftbodyEnv):
     def _measure(self) -> np.ndarray:
         holds = [float(node is not None) for node in self.pickers.held]
         pickers = self.pickers.positions
-        reaches = self._nodes[[0, -1]] - pickers[:, None]
+        reaches = (self._nodes[[0, -1]] - pickers[:, None]) / REACH
         return np.concatenate([self._nodes[list(KEY_NODES)].ravel(), pickers.ravel(), holds, reaches.ravel()])
 
     def performance(self) -> float:

@@ -101,6 +101,7 @@ class VisualActorCritic(Algorithm):
         check_precision(precision)
         self.precision = precision
         self.compile_mode = compile_mode
+        self.encoder_tau = encoder_tau
         self.actor_update_interval = actor_update_interval
         self.reward_scale = reward_scale
         self.augmentation_pad = augmentation_pad
@@ -113,7 +114,6 @@ class VisualActorCritic(Algorithm):
         self._metrics: dict[str, list[th.Tensor]] = defaultdict(list)
         kwargs["target_update_interval"] = target_update_interval
         super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, *args, **kwargs)
-        self.encoder_tau = min(self.encoder_tau_ratio * self.tau, 1.0) if encoder_tau is None else encoder_tau
 
     def _objective(self) -> tuple[type[Objective] | None, dict[str, Any]]:
         """
@@ -362,12 +362,19 @@ class VisualActorCritic(Algorithm):
             self.ent_coef_optimizer.step()
             self._metrics["ent_coef_loss"].append(ent_coef_loss.detach())
 
+    @property
+    def momentum_tau(self) -> float:
+        """
+        :return: tau of the momentum encoder: ``encoder_tau``, or what follows from ``tau`` as it is now
+        """
+        return min(self.encoder_tau_ratio * self.tau, 1.0) if self.encoder_tau is None else self.encoder_tau
+
     def _update_targets(self) -> None:
         """theta_m <- tau theta_o + (1 - tau) theta_m for encoder and Q networks, each with its tau."""
-        polyak_update(self.critic.encoder_parameters(), self.critic_target.encoder_parameters(), self.encoder_tau)
+        polyak_update(self.critic.encoder_parameters(), self.critic_target.encoder_parameters(), self.momentum_tau)
         polyak_update(self.critic.head_parameters(), self.critic_target.head_parameters(), self.tau)
         if self.policy.objective is not None:
-            self.policy.objective.update_momentum(self.encoder_tau)
+            self.policy.objective.update_momentum(self.momentum_tau)
         # Copy running stats, see SB3 #996
         polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 

@@ -166,7 +166,7 @@ def test_momentum_projector_follows_the_projector():
 
 def test_drq_has_one_tau_and_two_augmentations_of_each():
     model = make_model(SACDrQ)
-    assert (model.encoder_tau, model.n_augmentations, model.n_target_augmentations) == (model.tau, 2, 2)
+    assert (model.momentum_tau, model.n_augmentations, model.n_target_augmentations) == (model.tau, 2, 2)
 
 
 @pytest.mark.parametrize("cls", [SACCURL, SACSPR])

@@ -233,5 +233,5 @@ def test_takes_sb3s_arguments_in_sb3s_order():
     ("cls", "tau", "expected"), [(VisualSAC, 0.01, 0.01), (SACDrQ, 0.01, 0.01), (SACPOR, 0.01, 0.05), (SACPOR, 0.5, 1.0)]
 )
 def test_momentum_encoder_follows_tau_unless_told(cls, tau, expected):
-    assert make_model(cls, tau=tau).encoder_tau == pytest.approx(expected)
-    assert make_model(cls, tau=tau, encoder_tau=0.3).encoder_tau == 0.3
+    assert make_model(cls, tau=tau).momentum_tau == pytest.approx(expected)
+    assert make_model(cls, tau=tau, encoder_tau=0.3).momentum_tau == 0.3

@@ -46,9 +46,7 @@ def measure(n_frames: int) -> list[dict[str, float]]:
             seconds = time.perf_counter() - start
             after = sizes(Path(folder))
             written = sum(size for file, size in after.items() if file not in before)
-            rows.append(
-                dict(steps=n_steps, seconds=seconds, mb_written=written / 1e6, mb_on_disk=sum(after.values()) / 1e6)
-            )
+            rows.append(dict(steps=n_steps, seconds=seconds, mb_written=written / 1e6, mb_on_disk=sum(after.values()) / 1e6))
     return rows
 
 

@@ -88,18 +88,20 @@ def make_model(name: str, batch: int, image_size: int, device: str, options: dic
 
 
 def make_floor(name: str, batch: int, image_size: int, device: str) -> Callable[[], None]:
-    """The bare encoder passes of one update, on images that are already float and on the device."""
-    trained, untrained = (round(batch * share) for share in ALGORITHMS[name][2])
+    """The bare encoder passes of one update, batch by batch, on images that are already float and on the device."""
+    trained, untrained = ([batch] * int(share) + [round(batch * (share % 1))] for share in ALGORITHMS[name][2])
     space = gym.spaces.Box(0, 255, (3, image_size, image_size), "uint8")
     encoder = WholeEncoder(space).to(device)
-    images = th.rand(max(trained, untrained), 3, image_size, image_size, device=device)
+    images = th.rand(batch, 3, image_size, image_size, device=device)
     images = images.contiguous(memory_format=th.channels_last)
 
     def passes() -> None:
         encoder.zero_grad()
-        encoder(images[:trained]).sum().backward()
+        for n_images in filter(None, trained):
+            encoder(images[:n_images]).sum().backward()
         with th.no_grad():
-            encoder(images[:untrained])
+            for n_images in filter(None, untrained):
+                encoder(images[:n_images])
 
     return passes
 

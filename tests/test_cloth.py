@@ -145,14 +145,22 @@ def test_starting_states_are_those_of_the_pages():
         expected = [middle + (0, -0.10, 0), middle + (0, 0.10, 0)]
         assert np.allclose(env.pickers.positions[:, :2], np.array(expected)[:, :2], atol=0.005)
         assert np.allclose(env.pickers.positions[:, 2], 0.10, atol=0.005)
-        assert env.state()[18:].tolist() == [0, 0]
+        assert env.state()[18:20].tolist() == [0, 0]
     for variation in range(0, 6):
         dropping.reset(options={"variation": variation})
         bottoms.append(dropping.cloth.grid()[-1, :, 2].mean())
-        assert dropping.state()[18:].tolist() == [1, 1]
+        assert dropping.state()[18:20].tolist() == [1, 1]
     assert 0.38 - 0.01 <= min(sizes) < 0.41 and 0.50 < max(sizes) <= 0.54 + 0.01
     assert -46 < min(yaws) < -20 and 20 < max(yaws) < 46
     assert 0.05 < min(bottoms) and max(bottoms) < 0.2 and np.ptp(bottoms) > 0.02
+
+
+def test_state_tells_the_ways_of_pickers_and_corners_in_steps_of_a_picker():
+    env = make()
+    env.reset(options={"variation": 5})
+    corners, pickers, ways = env.state()[:12].reshape(4, 3), env.pickers.positions, env.state()[20:]
+    np.testing.assert_allclose(ways[:6].reshape(2, 3) * 0.08, corners[:2] - pickers, atol=1e-6)
+    np.testing.assert_allclose(ways[6:].reshape(2, 3) * 0.08, corners[2:] - corners[:2], atol=1e-6)
 
 
 def test_first_action_decides_whether_the_hanging_cloth_drops():

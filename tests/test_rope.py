@@ -197,7 +197,10 @@ def test_state_holds_the_key_nodes_the_pickers_and_what_they_hold(env):
     state = env.state()
     np.testing.assert_allclose(state[:30].reshape(10, 3), env.rope.nodes()[list(KEY_NODES)], atol=1e-6)
     np.testing.assert_allclose(state[30:36].reshape(2, 3), env.pickers.positions, atol=1e-6)
-    assert state[36:].tolist() == [float(node is not None) for node in env.pickers.held]
+    assert state[36:38].tolist() == [float(node is not None) for node in env.pickers.held]
+    for picker, reaches in enumerate(state[38:].reshape(2, 2, 3)):  # in steps of a picker
+        ends = env.rope.nodes()[[0, -1]]
+        np.testing.assert_allclose(reaches * 0.08, ends - env.pickers.positions[picker], atol=1e-6)
 
 
 def test_rope_parts_do_not_pass_through_each_other(env):

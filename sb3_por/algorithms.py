@@ -85,7 +85,8 @@ class TQCPOR(WithPartialOrder, VisualTQC):
 class SACDrQ(VisualSAC):
     """
     DrQ (https://arxiv.org/abs/2004.13649): SAC from pixels with [K, M] random shifts and nothing else. Losses are
-    averaged over the M augmentations; DrQ sums them, which Adam does not notice. Arguments: those of ``VisualSAC``.
+    averaged over the M augmentations; DrQ sums them, which Adam does not notice. One ``tau`` moves all targets. Arguments:
+    those of ``VisualSAC``.
 
     :param n_augmentations: DrQ's M
     :param n_target_augmentations: DrQ's K

@@ -98,8 +98,8 @@ class FoldClothEnv(SoftbodyEnv):
       little further off.
     * Layers do not collide with each other: they lie in each other, and a perfect fold scores 1 but for what moved.
     * Pickers do not push the cloth, and they cannot tear it apart (SoftGym has a guard against that, switched off).
-    * The state also says which picker holds something, where its corner is from it, and how far the
-      corner has to go, both in units of what a picker moves in one step.
+    * The state also says which picker holds something, where its corner is from it, and how far the corner has to go, both
+      in units of what a picker moves in one step.
     * The cloth has no stripe of the other colour.
 
     ## Version History

@@ -9,21 +9,19 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.acceleration import check_precision, compile_networks
-from sb3_por.augmentations import RandomShift
 from sb3_por.memory import keep_freed_memory
 from sb3_por.objectives.base import Objective
 from sb3_por.overlap import OverlappedEnv
+from sb3_por.preparation import Preparation
 from sb3_por.replay import SequenceReplayBuffer
 from sb3_por.rng import get_rng_state, set_rng_state
-from sb3_por.views import Views, take_rows
+from sb3_por.views import Views
 
 if TYPE_CHECKING:
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm as Algorithm
@@ -150,8 +148,7 @@ class VisualActorCritic(Algorithm):
         if self.compile_mode is not None:
             compile_networks(self.policy, self.compile_mode)
         self._metrics = defaultdict(list)
-        self._augment = RandomShift(self.augmentation_pad)
-        self._image_keys = self._find_image_keys()
+        self._preparation = Preparation(self.policy, self.augmentation_pad, self.n_augmentations, self.n_target_augmentations)
 
     def _check_buffer(self) -> None:
         """The objective needs frames that only some buffers can sample."""
@@ -165,13 +162,6 @@ class VisualActorCritic(Algorithm):
                 f"{type(buffer).__name__} cannot sample the later frames that {type(self).__name__} needs with these "
                 "settings: use the default replay_buffer_class, SequenceReplayBuffer."
             )
-
-    def _find_image_keys(self) -> list[str]:
-        """Keys of the image observations, "" for an observation that is one image."""
-        space = self.observation_space
-        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-        normalized = not self.policy.normalize_images
-        return [key for key, part in parts.items() if is_image_space(part, normalized_image=normalized)]
 
     @abstractmethod
     def _next_values(self, features: th.Tensor, actions: th.Tensor, entropy_term: th.Tensor) -> th.Tensor:
@@ -230,7 +220,7 @@ class VisualActorCritic(Algorithm):
         if self.use_sde:
             # log_std may have changed since the last update
             self.actor.reset_noise()
-        views = self._make_views(replay_data)
+        views = self._preparation.views(replay_data)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
         with self._autocast():
             critic_loss, objective_loss = self._encoder_losses(replay_data, views, ent_coef)
@@ -255,17 +245,19 @@ class VisualActorCritic(Algorithm):
 
     def _encoder_losses(self, replay_data: Any, views: Views, ent_coef: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """L_RL and lambda * L_objective: the two losses that train the encoder."""
-        for name in self._next_names():
+        for name in self._preparation.next_names:
             # All rows at once, before the objective asks for some of them
             views.momentum(name)
         objective_loss = self._objective_loss(views)
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         with th.no_grad():
-            next_values = [self._value_of(views, name, ent_coef) for name in self._next_names()]
+            next_values = [self._value_of(views, name, ent_coef) for name in self._preparation.next_names]
             target = self.reward_scale * replay_data.rewards
             target = target + (1 - replay_data.dones) * discounts * sum(next_values) / len(next_values)
-        critic_losses = [self._critic_loss(views.online(name), replay_data.actions, target) for name in self._obs_names()]
+        critic_losses = [
+            self._critic_loss(views.online(name), replay_data.actions, target) for name in self._preparation.obs_names
+        ]
         return th.stack(critic_losses).mean(), objective_loss
 
     def _sample(self, batch_size: int) -> Any:
@@ -279,46 +271,6 @@ class VisualActorCritic(Algorithm):
         # One step later is next_observations already
         future = None if objective.future == (1, 1) and self.n_steps == 1 else objective.future
         return self.replay_buffer.sample(batch_size, normalizer, future, objective.past, objective.window)
-
-    def _obs_names(self) -> list[str]:
-        return ["obs", *(f"obs_{i}" for i in range(1, self.n_augmentations))]
-
-    def _next_names(self) -> list[str]:
-        return ["next", *(f"next_{i}" for i in range(1, self.n_target_augmentations))]
-
-    def _make_views(self, replay_data: Any) -> Views:
-        """Augment every frame independently and cast it to float, once."""
-        frames = {name: self._prepare(replay_data.observations) for name in self._obs_names()}
-        frames.update((name, self._prepare(replay_data.next_observations)) for name in self._next_names())
-        data = {"actions": replay_data.actions}
-        objective = self.policy.objective
-        if objective is not None:
-            future = getattr(replay_data, "future_observations", None)
-            frames["future"] = frames["next"] if future is None else self._prepare(future)
-            self._add_past(frames, data, replay_data, getattr(replay_data, "past_observations", None))
-            if objective.positive:
-                frames["positive"] = self._prepare(replay_data.observations)
-            if objective.window > 0:
-                frames["window"] = self._prepare(_flatten_window(replay_data.window_observations))
-                data.update(window_actions=replay_data.window_actions, window_mask=replay_data.window_mask)
-        return Views(self.critic, self.critic_target, frames, data)
-
-    def _add_past(self, frames: dict[str, Any], data: dict[str, th.Tensor], replay_data: Any, past: Any) -> None:
-        """Add these earlier frames of the first half of the batch, if the replay buffer has any."""
-        if getattr(replay_data, "past_gaps", None) is not None:
-            frames["past"] = self._prepare(_first_half(past))
-            data["past_gaps"] = _first_half(replay_data.past_gaps)
-
-    def _prepare(self, observations: Any) -> Any:
-        """Augment and preprocess one set of observations."""
-        augmented: Any
-        if isinstance(observations, dict):
-            augmented = {
-                key: self._augment(value) if key in self._image_keys else value for key, value in observations.items()
-            }
-        else:
-            augmented = self._augment(observations) if self._image_keys else observations
-        return self.policy.preprocess(augmented)
 
     def _objective_loss(self, views: Views) -> th.Tensor:
         """The objective's weighted loss."""
@@ -386,7 +338,7 @@ class VisualActorCritic(Algorithm):
         for name, norm in self._encoder_grad_norms(critic_loss, objective_loss).items():
             self._metrics[f"encoder_grad_norm_{name}"].append(norm)
         with th.no_grad():
-            self._log_objective(objective.control(self._control_views(replay_data)))
+            self._log_objective(objective.control(self._preparation.control_views(replay_data)))
 
     def _encoder_grad_norms(self, critic_loss: th.Tensor, objective_loss: th.Tensor) -> dict[str, th.Tensor]:
         """How hard each loss pulls at the encoder; keeps the graph."""
@@ -397,13 +349,6 @@ class VisualActorCritic(Algorithm):
             parts = [gradient.norm() for gradient in gradients if gradient is not None]
             norms[name] = th.stack(parts).norm() if parts else th.zeros(())
         return norms
-
-    def _control_views(self, replay_data: Any) -> Views:
-        """The observations in all places, augmented independently: what an objective's control is shown."""
-        frames = {name: self._prepare(replay_data.observations) for name in ("obs", "future")}
-        data: dict[str, th.Tensor] = {}
-        self._add_past(frames, data, replay_data, replay_data.observations)
-        return Views(self.critic, self.critic_target, frames, data)
 
     def _record_metrics(self) -> None:
         """Move the means since the last time to the logger: the one place that waits for the device."""
@@ -490,17 +435,4 @@ class VisualActorCritic(Algorithm):
             self.rng_state = None
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_augment"]
-
-
-def _first_half(rows: Any) -> Any:
-    """The first half of a batch, also of a dict of them."""
-    n = len(next(iter(rows.values())) if isinstance(rows, dict) else rows)
-    return take_rows(rows, slice(n // 2))
-
-
-def _flatten_window(observations: Any) -> Any:
-    """From shape ``(batch, K, ...)`` to ``(batch * K, ...)``."""
-    if isinstance(observations, dict):
-        return {key: value.flatten(0, 1) for key, value in observations.items()}
-    return observations.flatten(0, 1)
+        return [*super()._excluded_save_params(), "_metrics", "_preparation"]

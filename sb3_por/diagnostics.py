@@ -105,13 +105,13 @@ def diagnose(model: Any, env_id: str, n_episodes: int = 5, seed: int = 0, vec_no
         env.close()
 
     batches = [_sample(model, own) for _ in range(N_BATCHES)]
-    views = [model._make_views(batch) for batch in batches]
+    views = [model._preparation.views(batch) for batch in batches]
     with th.no_grad():
         measured = [objective.loss(view)[1] for view in views]
-        leaks = [objective.control(model._control_views(batch)) for batch in batches]
-        at_random = [objective.loss(model._make_views(_sample(model, random)))[1] for _ in range(N_BATCHES)]
+        leaks = [objective.control(model._preparation.control_views(batch)) for batch in batches]
+        at_random = [objective.loss(model._preparation.views(_sample(model, random)))[1] for _ in range(N_BATCHES)]
     ent_coef = model.ent_coef_tensor if model.log_ent_coef is None else model.log_ent_coef.detach().exp()
-    norms = model._encoder_grad_norms(*model._encoder_losses(batches[0], model._make_views(batches[0]), ent_coef))
+    norms = model._encoder_grad_norms(*model._encoder_losses(batches[0], model._preparation.views(batches[0]), ent_coef))
     changing = [value for value in correlations if not np.isnan(value)]
     return Diagnosis(
         loss=_mean(measured, "loss"),

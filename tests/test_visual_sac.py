@@ -46,7 +46,7 @@ def test_unshared_actor_trains_a_trunk_of_its_own():
 
 def test_critic_loss_trains_the_encoder_and_actor_loss_leaves_no_gradient_there():
     model = make_model()
-    views = model._make_views(model._sample(8))
+    views = model._preparation.views(model._sample(8))
     critic_loss = model._critic_loss(views.online("obs"), views.data["actions"], th.zeros(8, 1))
     critic_loss.backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.critic.encoder_parameters())
@@ -144,17 +144,17 @@ def test_reward_scale_scales_the_target():
 def test_k_and_m_augmentations_are_averaged():
     model = make_model(n_augmentations=2, n_target_augmentations=2, augmentation_pad=0)
     assert count_encodings(model) == dict(online=32, momentum=16)
-    views = model._make_views(model._sample(4))
+    views = model._preparation.views(model._sample(4))
     assert set(views.frames) == {"obs", "obs_1", "next", "next_1"}
 
 
 def test_frames_are_augmented_independently():
     model = make_model(SACPOR, augmentation_pad=4)
-    frames = model._make_views(model._sample(64)).frames
+    frames = model._preparation.views(model._sample(64)).frames
     assert frames["future"] is frames["next"]
     th.manual_seed(0)
     replay_data = model._sample(64)
-    first, second = model._prepare(replay_data.observations), model._prepare(replay_data.observations)
+    first, second = model._preparation.prepare(replay_data.observations), model._preparation.prepare(replay_data.observations)
     assert not th.equal(first, second)
     assert first.dtype == th.float32 and first.max() <= 1.0
 

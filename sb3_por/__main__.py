@@ -227,7 +227,7 @@ COMMANDS = {
         run=_enjoy,
     ),
     "plot": Command(
-        help="draw learning curves and comparisons with 95 % stratified bootstrap intervals",
+        help="draw learning curves and comparisons with 95 %% stratified bootstrap intervals",
         example="logs/sac_por logs/sac --kind tasks -o tasks.pdf --csv scores.csv",
         add_arguments=_plot_arguments,
         run=_plot,

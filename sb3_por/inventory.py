@@ -12,14 +12,14 @@ from sb3_por.scores import run_identity
 LOG = "log.txt"
 LOG_LINES = 15
 #: Arguments of train.py that belong to a run's settings; the others say where files are and how the search is done.
-ARGUMENTS = ("eval_freq", "eval_episodes", "save_freq", "num_threads", "device", "vec_env", "env_kwargs", "conf_file")
+ARGUMENTS = ("algo", "eval_freq", "eval_episodes", "save_freq", "num_threads", "device", "vec_env", "env_kwargs", "conf_file")
 
 
 @dataclass(frozen=True)
 class RunFacts:
     """
     :param env: environment id
-    :param algo: name of the algorithm
+    :param algo: name of the algorithm, or the run's label
     :param seed: seed
     :param folder: where its files are
     :param state: ``"finished"``, ``"running"`` or ``"stopped"``

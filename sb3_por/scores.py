@@ -74,7 +74,7 @@ def run_identity(run: Path) -> dict[str, Any]:
     name, _, number = run.name.rpartition("_")
     return {
         "env": arguments.get("env", name or run.name),
-        "algo": arguments.get("algo", run.parent.name),
+        "algo": arguments.get("label") or arguments.get("algo", run.parent.name),
         "seed": int(arguments.get("seed", number if number.isdigit() else 0)),
     }
 

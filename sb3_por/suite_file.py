@@ -19,7 +19,7 @@ class Suite:
     """
     What a suite file says. Every combination of algorithm, environment and seed is a run.
 
-    :param algos: names of algorithms
+    :param algos: names of algorithms and variants
     :param envs: environment ids
     :param seeds: seeds
     :param n_timesteps: steps of each run; those of the settings if ``None``
@@ -27,6 +27,7 @@ class Suite:
     :param eval_episodes: episodes of an evaluation
     :param save_freq: steps between two checkpoints
     :param hyperparams: changes to the settings of all runs
+    :param variants: name -> the algorithm (``algo``) that runs under this name, and changes to its settings
     :param overrides: algorithm, environment, or ``algorithm/environment`` -> changes to the settings of its runs
     :param workers: processes at a time on this machine; the number of cores divided by ``threads`` if ``None``
     :param threads: PyTorch threads of a run, and the CPUs that it takes of a Ray cluster
@@ -41,6 +42,7 @@ class Suite:
     eval_episodes: int = 10
     save_freq: int = 10_000
     hyperparams: dict[str, Any] = field(default_factory=dict)
+    variants: dict[str, dict[str, Any]] = field(default_factory=dict)
     overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
     workers: int | None = None
     threads: int = 1
@@ -52,8 +54,9 @@ class Run:
     """
     One run of a suite.
 
-    :param folder: ``<root>/<env>/<algo>/seed_<seed>``; the zoo's layout begins in it
-    :param flags: of train.py, besides algorithm, environment, seed and folder
+    :param folder: ``<root>/<env>/<algo or variant>/seed_<seed>``; the zoo's layout begins in it
+    :param flags: of train.py, besides algorithm, environment, seed, folder and label
+    :param variant: name of the suite's variant; empty for the algorithm itself
     """
 
     algo: str
@@ -61,10 +64,11 @@ class Run:
     seed: int
     folder: Path
     flags: tuple[str, ...]
+    variant: str = ""
 
     @property
     def name(self) -> str:
-        return f"{self.env}/{self.algo}/seed_{self.seed}"
+        return f"{self.env}/{self.variant or self.algo}/seed_{self.seed}"
 
     @property
     def run_folder(self) -> Path:
@@ -87,7 +91,8 @@ class Run:
         if self.state() == "interrupted":
             return [*train, "--resume", str(self.run_folder)]
         named = ["--algo", self.algo, "--env", self.env, "--seed", str(self.seed), "-f", str(self.folder)]
-        return [*train, *named, *self.flags]
+        label = ["--label", self.variant] if self.variant else []
+        return [*train, *named, *label, *self.flags]
 
 
 def suite_runs(suite: Suite, root: Path) -> list[Run]:
@@ -102,13 +107,16 @@ def suite_runs(suite: Suite, root: Path) -> list[Run]:
     runs = []
     for seed in suite.seeds:
         for env in suite.envs:
-            for algo in suite.algos:
-                changes = dict(suite.hyperparams)
-                for key in (env, algo, f"{algo}/{env}"):
+            for name in suite.algos:
+                variant = dict(suite.variants.get(name, {}))
+                algo = variant.pop("algo", name)
+                changes = suite.hyperparams | variant
+                for key in (env, name, f"{name}/{env}"):
                     changes |= suite.overrides.get(key, {})
                 params = ["-params", *(f"{name}:{value!r}" for name, value in changes.items())] if changes else []
                 flags = [*common, "--num-threads", str(suite.threads), *params]
-                runs.append(Run(algo, env, seed, root / env / algo / f"seed_{seed}", tuple(flags)))
+                folder = root / env / name / f"seed_{seed}"
+                runs.append(Run(algo, env, seed, folder, tuple(flags), variant=name if name in suite.variants else ""))
     return runs
 
 
@@ -119,6 +127,7 @@ _EXAMPLES = {
     "envs": "[PourWater-v0]",
     "seeds": "[0, 1, 2]",
     "hyperparams": "{por_coef: 0.1}",
+    "variants": "{por_paper: {algo: sac_por, pairing: paper}}",
     "overrides": "{sac_por: {por_coef: 0.1}}",
 }
 _REQUIRED = ("algos", "envs", "seeds")
@@ -172,7 +181,10 @@ class _Checks:
                 raise UserError(f"{self.path} has no {name}; add a line such as {name}: {_EXAMPLES[name]}")
         for name, of_name in nodes.items():
             self._type(of_name, name, values[name])
-        for name, kind, known in (("algos", "algorithm", list(LOADABLE)), ("envs", "environment", list(gym.registry))):
+        if "variants" in nodes:
+            self._variants(nodes["variants"])
+        algos = [*LOADABLE, *values.get("variants", {})]
+        for name, kind, known in (("algos", "algorithm", algos), ("envs", "environment", list(gym.registry))):
             for one in nodes[name].value:
                 self._known(one, kind, known)
         if "overrides" in nodes:
@@ -202,8 +214,8 @@ class _Checks:
     def _type(self, node: yaml.Node, name: str, value: Any) -> None:
         if name in _REQUIRED:
             self._list(node, name, value)
-        elif name in ("hyperparams", "overrides"):
-            inner = value.values() if name == "overrides" and isinstance(value, dict) else []
+        elif name in ("hyperparams", "variants", "overrides"):
+            inner = value.values() if name != "hyperparams" and isinstance(value, dict) else []
             if not all(isinstance(one, dict) for one in [value, *inner]):
                 self._fail(node, f"{name} must be a mapping, such as {_EXAMPLES[name]}")
         elif name == "gpus":
@@ -211,6 +223,15 @@ class _Checks:
                 self._fail(node, f"gpus must be a number such as 1 or 0.5, got {value!r}")
         elif type(value) is not int or value < 1:
             self._fail(node, f"{name} must be a positive integer, got {value!r}")
+
+    def _variants(self, node: yaml.MappingNode) -> None:
+        for name, settings in node.value:
+            if name.value in LOADABLE:
+                self._fail(name, f"{name.value} is an algorithm; give the variant another name")
+            algos = [value for key, value in settings.value if key.value == "algo"]
+            if not algos:
+                self._fail(name, f"{name.value} has no algo; write for example variants: {_EXAMPLES['variants']}")
+            self._known(algos[0], "algorithm", list(LOADABLE))
 
     def _list(self, node: yaml.Node, name: str, value: Any) -> None:
         is_one = _is_seed if name == "seeds" else _is_name

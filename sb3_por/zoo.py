@@ -116,6 +116,7 @@ class Parser(argparse.ArgumentParser):
     def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]
         self.set_defaults(**DEFAULTS, progress=sys.stderr.isatty())
         self.add_argument("--resume", metavar="RUN_FOLDER", help="go on with a killed run; its folder has the settings")
+        self.add_argument("--label", metavar="NAME", help="what tables and figures call the run, instead of its algorithm")
         args = super().parse_args()
         if args.resume:
             return self._resumed(Path(args.resume))

@@ -10,12 +10,13 @@ from sb3_por.scores import COLUMNS
 STEPS = [100, 200, 300]
 
 
-def write_run(folder, algo="sac_por", env="PourWater-v0", seed=1, performance=(0.1, 0.2, 0.4), steps=STEPS, settings=True):
+def write_run(folder, algo="sac_por", env="PourWater-v0", seed=1, performance=(0.1, 0.2, 0.4), steps=STEPS, settings=True, label=None):
     """A run folder as train.py leaves it, two episodes an evaluation."""
     run = folder / algo / f"{env}_{seed}"
     (run / env).mkdir(parents=True)
     if settings:
-        (run / env / "args.yml").write_text(yaml.safe_dump({"algo": algo, "env": env, "seed": seed, "commit": "abc"}))
+        arguments = {"algo": algo, "env": env, "seed": seed, "commit": "abc", "label": label}
+        (run / env / "args.yml").write_text(yaml.safe_dump(arguments))
     episodes = np.array(performance)[:, None] + np.array([-0.05, 0.05])
     np.savez(
         run / "evaluations.npz",

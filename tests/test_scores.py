@@ -20,6 +20,12 @@ def test_a_run_becomes_rows(tmp_path):
     assert rows["wall_clock_s"].tolist() == [10.0, 20.0, 30.0]
 
 
+def test_a_labelled_run_goes_by_its_label(tmp_path):
+    write_run(tmp_path, algo="sac_por", label="por_paper")
+    write_run(tmp_path / "plain", algo="sac_por")
+    assert set(read_scores([tmp_path])["algo"]) == {"sac_por", "por_paper"}
+
+
 def test_runs_are_found_at_any_depth_and_named_by_their_path_where_settings_lack(tmp_path):
     write_run(tmp_path / "deep" / "er", algo="sac", seed=3, settings=False)
     write_run(tmp_path, algo="sac_por", seed=1)

@@ -54,6 +54,21 @@ def test_a_suite_is_every_combination_with_its_settings(suite_file, tmp_path):
     assert by_name["PourWater-v0/sac/seed_3"].folder == tmp_path / "runs" / "PourWater-v0" / "sac" / "seed_3"
 
 
+def test_a_variant_is_an_algorithm_with_settings_and_a_name(suite_file, tmp_path):
+    suite = read_suite(
+        suite_file(
+            "algos: [sac_por, por_paper]\nenvs: [PourWater-v0]\nseeds: [0]\nhyperparams: {pairing: swap, k: 2}\n"
+            "variants:\n  por_paper: {algo: sac_por, pairing: paper}\noverrides: {por_paper: {k: 3}}\n"
+        )
+    )
+    plain, variant = suite_runs(suite, tmp_path)
+    assert plain.flags[-2:] == ("pairing:'swap'", "k:2") and "--label" not in plain.command()
+    assert variant.flags[-2:] == ("pairing:'paper'", "k:3")
+    assert variant.name == "PourWater-v0/por_paper/seed_0"
+    command = " ".join(variant.command())
+    assert "--algo sac_por" in command and "--label por_paper" in command
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -76,6 +91,13 @@ def test_a_suite_is_every_combination_with_its_settings(suite_file, tmp_path):
         ("algos: []\nenvs: [Pendulum-v1]\nseeds: [0]\n", "grid.yml:1: algos must be a list, such as [sac_por, sac]"),
         ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [-1]\n", "grid.yml:3: seeds must be a list, such as [0, 1, 2]"),
         ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\ngpus: many\n", "grid.yml:4: gpus must be a number such as 1"),
+        (
+            "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\nvariants:\n  sac: {algo: sac_por}\n",
+            "grid.yml:5: sac is an algorithm; give the variant another name",
+        ),
+        ("algos: [v]\nenvs: [Pendulum-v1]\nseeds: [0]\nvariants: {v: {k: 2}}\n", "grid.yml:4: v has no algo; write for"),
+        ("algos: [v]\nenvs: [Pendulum-v1]\nseeds: [0]\nvariants: {v: {algo: sacc}}\n", "grid.yml:4: unknown algorithm 'sacc'"),
+        ("algos: [v]\nenvs: [Pendulum-v1]\nseeds: [0]\nvariants: {v: 3}\n", "grid.yml:4: variants must be a mapping"),
         (
             "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\noverrides:\n  sac:\n    gamma: 1\n    gamma: 0.9\n",
             "grid.yml:7: gamma stands on line 6, too; keep one",

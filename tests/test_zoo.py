@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_por import ALGORITHMS
 from sb3_por.errors import UserError
 from sb3_por.loading import load_model
-from sb3_por.scores import read_scores
+from sb3_por.scores import read_scores, run_identity
 from sb3_por.zoo import Experiment, check_policy, hyperparameter_file, main
 from softbody_envs import ENV_IDS
 
@@ -86,8 +86,10 @@ def test_a_resumed_run_goes_on_counting_without_a_second_warm_up(finished_run, t
 
     monkeypatch.setattr(SAC, "_sample_action", sample)
     flags = ["-n", "60", "--eval-freq", "-1", "-i", str(finished_run / "Pendulum-v1.zip"), "-f", str(tmp_path)]
-    assert main([*PENDULUM, *flags, *SMALL]) == 0
-    model = load_model(tmp_path / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip")
+    assert main([*PENDULUM, *flags, "--label", "warm", *SMALL]) == 0
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    assert run_identity(run) == {"env": "Pendulum-v1", "algo": "warm", "seed": 1}
+    model = load_model(run / "Pendulum-v1.zip")
     assert model.num_timesteps == 460 and model._total_timesteps == 460
     assert len(sampled) == 60 and not any(sampled)
 

@@ -10,7 +10,9 @@ from sb3_por.scores import COLUMNS
 STEPS = [100, 200, 300]
 
 
-def write_run(folder, algo="sac_por", env="PourWater-v0", seed=1, performance=(0.1, 0.2, 0.4), steps=STEPS, settings=True, label=None):
+def write_run(
+    folder, algo="sac_por", env="PourWater-v0", seed=1, performance=(0.1, 0.2, 0.4), steps=STEPS, settings=True, label=None
+):
     """A run folder as train.py leaves it, two episodes an evaluation."""
     run = folder / algo / f"{env}_{seed}"
     (run / env).mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The table of order: POR's loss and accuracy during training, read from runs' TensorBoard files or from a ``.csv``."""
+"""The table of order: what POR logs of itself during training, read from runs' TensorBoard files or from a ``.csv``."""
 
 import logging
 import math
@@ -14,7 +14,10 @@ from sb3_por.runs import find_runs
 from sb3_por.scores import RUN_KEYS, join_runs, run_identity
 
 #: Chance is ln 2 for the losses and 0.5 for the accuracies; those of the control (k = 0) must stay there.
-ORDER_METRICS = ["por_loss", "por_accuracy", "por_leak_loss", "por_leak_accuracy"]
+CLASSIFIER_METRICS = ["por_loss", "por_accuracy", "por_leak_loss", "por_leak_accuracy"]
+#: How hard the critic's loss and the weighted POR loss pull at the encoder.
+GRADIENT_METRICS = ["encoder_grad_norm_critic", "encoder_grad_norm_por"]
+ORDER_METRICS = [*CLASSIFIER_METRICS, *GRADIENT_METRICS]
 ORDER_COLUMNS = [*RUN_KEYS, "step", *ORDER_METRICS]
 
 

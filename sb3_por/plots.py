@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_por.drawing import curve, interval, legend_below, looks, name_rows, one_panel, panels, steps_axis, style
+from sb3_por.drawing import Look, curve, interval, legend_below, looks, name_rows, one_panel, panels, steps_axis, style
 from sb3_por.grids import in_order
+from sb3_por.order_logs import GRADIENT_METRICS
 
 LABELS = {
     "normalized_performance": "normalized performance",
@@ -15,6 +17,8 @@ LABELS = {
     "success": "success rate",
     "por_loss": "POR loss",
     "por_accuracy": "POR accuracy",
+    "encoder_grad_norm_critic": "critic",
+    "encoder_grad_norm_por": "λ POR",
 }
 #: What a classifier that knows nothing has, its name, and the limits of the axis.
 CHANCE = {"por_loss": (math.log(2), "ln 2", (0, 1.05)), "por_accuracy": (0.5, "½", (0.3, 1.02))}
@@ -144,12 +148,15 @@ def draw_order(table: pd.DataFrame) -> Figure:
     :param table: of :func:`sb3_por.statistics.order_curves`
     """
     by_algo, envs = looks(table["algo"]), sorted(table["env"].unique())
+    n_rows = len(CHANCE) + table["metric"].isin(GRADIENT_METRICS).any()
     with style():
-        figure = Figure(figsize=(max(4 * len(envs), 6), 6.4), layout="constrained")
-        grid = figure.subplots(2, len(envs), sharex="col", squeeze=False)
+        figure = Figure(figsize=(max(4 * len(envs), 6), 3.2 * n_rows), layout="constrained")
+        grid = figure.subplots(n_rows, len(envs), sharex="col", squeeze=False)
         for j, env in enumerate(envs):
             here = table[table["env"] == env]
-            for axes, (metric, (chance, name, limits)) in zip(grid[:, j], CHANCE.items(), strict=True):
+            if n_rows > len(CHANCE):
+                _gradients(grid[-1, j], here, by_algo)
+            for axes, (metric, (chance, name, limits)) in zip(grid[: len(CHANCE), j], CHANCE.items(), strict=True):
                 for algo, rows in _algos(here[here["metric"] == metric]):
                     low, high = rows["mean"] - rows["std"], rows["mean"] + rows["std"]
                     curve(axes, rows["step"], rows["mean"], low, high, by_algo[algo], algo)
@@ -161,9 +168,19 @@ def draw_order(table: pd.DataFrame) -> Figure:
                 axes.set_ylabel(LABELS[metric])
                 axes.set_ylim(*limits)
             grid[0, j].set_title(env)
-            steps_axis(grid[1, j])
+            steps_axis(grid[-1, j])
         legend_below(figure, grid.ravel(), _spread(table))
     return figure
+
+
+def _gradients(axes: Axes, table: pd.DataFrame, by_algo: dict[str, Look]) -> None:
+    """How hard each loss pulls at the encoder: means over seeds, the critic's dotted."""
+    for metric, dash in zip(GRADIENT_METRICS, (":", "-"), strict=True):
+        for algo, rows in _algos(table[table["metric"] == metric]):
+            label = f"{algo}, {LABELS[metric]}"
+            axes.plot(rows["step"], rows["mean"], color=by_algo[algo].color, linestyle=dash, linewidth=1.5, label=label)
+    axes.set_yscale("log", nonpositive="mask")
+    axes.set_ylabel("gradient norm at the encoder")
 
 
 def _algos(table: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:

@@ -38,6 +38,8 @@ def log_order(run, losses, folder="SACPOR_1", first_step=100):
         for i, loss in enumerate(losses):
             writer.add_scalar("train/por_loss", loss, first_step + 100 * i)
             writer.add_scalar("train/por_accuracy", 1 - loss, first_step + 100 * i)
+            writer.add_scalar("train/encoder_grad_norm_critic", 10.0, first_step + 100 * i)
+            writer.add_scalar("train/encoder_grad_norm_por", loss, first_step + 100 * i)
 
 
 def table(algo, env, seed, performance, steps=STEPS):

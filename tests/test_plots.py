@@ -10,7 +10,7 @@ from made_runs import log_order, random_scores, table, write_run
 from sb3_por.drawing import KNOWN, looks
 from sb3_por.errors import UserError
 from sb3_por.figures import KINDS, plot, plot_all, plot_order, save_all
-from sb3_por.order_logs import find_order, read_order, write_order
+from sb3_por.order_logs import GRADIENT_METRICS, find_order, read_order, write_order
 
 
 def texts(figure):
@@ -108,6 +108,10 @@ def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
     loss = one.table[one.table["metric"] == "por_loss"]
     assert loss["mean"].to_numpy() == pytest.approx([0.7, 0.5, 0.3]) and not notes
     assert {"POR loss", "POR accuracy", "PourWater-v0", "ln 2", "sac_por"} <= set(texts(one.figure).splitlines())
+    gradients = {line.get_label(): line.get_ydata().tolist() for line in one.figure.axes[-1].lines}
+    assert gradients["sac_por, critic"] == [10] * 3 and gradients["sac_por, λ POR"] == pytest.approx([0.7, 0.5, 0.3])
+    bare, _ = plot_order(order.drop(columns=GRADIENT_METRICS).reindex(columns=order.columns))
+    assert len(bare.figure.axes) == 2
 
 
 def test_what_a_resumed_run_logs_again_replaces_what_it_had_logged(tmp_path):

@@ -11,6 +11,7 @@ from rliable import metrics
 
 from sb3_por.errors import UserError
 from sb3_por.grids import read_grid
+from sb3_por.order_logs import ORDER_COLUMNS
 from sb3_por.statistics import (
     aggregates,
     improvements,
@@ -204,7 +205,8 @@ def test_a_ratio_to_a_rival_at_zero_is_infinite_and_that_is_said():
 
 def test_order_curves_have_each_metric_where_it_was_logged():
     runs = [table("sac_por", "T", seed, np.nan).drop(columns="normalized_performance") for seed in (0, 1)]
-    order = pd.concat(runs).assign(por_loss=[0.7, 0.6, 0.5, 0.7, 0.4, 0.1], por_accuracy=0.8, por_leak_accuracy=np.nan)
+    order = pd.concat(runs).reindex(columns=ORDER_COLUMNS)
+    order = order.assign(por_loss=[0.7, 0.6, 0.5, 0.7, 0.4, 0.1], por_accuracy=0.8, por_leak_accuracy=np.nan)
     order["por_leak_loss"] = [np.nan, 0.6, 0.7, np.nan, 0.7, 0.7]
     curves, notes = order_curves(order)
     loss, leak = (curves[curves["metric"] == name] for name in ("por_loss", "por_leak_loss"))

@@ -1,6 +1,7 @@
 """Errors that a user can mend, and the one place that shows them."""
 
 import difflib
+import os
 import sys
 from collections.abc import Callable, Iterable
 
@@ -19,16 +20,21 @@ def exit_code(command: Callable[[], object], prog: str) -> int:
     :param command: called without arguments
     :param prog: what the user typed, starts the message
     :return: what the command returns if that is a number, else 0; 2 after a ``UserError``, shown as one line on stderr;
-        130 after Ctrl-C
+        130 after Ctrl-C, 141 when whoever reads the output has gone (``| head``)
     """
     try:
         result = command()
+        sys.stdout.flush()
     except UserError as error:
         print(f"{prog}: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
         print(f"{prog}: {interrupt or 'interrupted'}", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        # Python flushes once more when it ends, which must not fail again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     return result if isinstance(result, int) else 0
 
 

@@ -41,6 +41,14 @@ def test_evaluate_from_the_shell_prints_json(run):
     assert result["mean"]["return"] == pytest.approx(np.mean(result["episodes"]["returns"]))
 
 
+def test_output_that_nobody_reads_on_is_no_error(tmp_path):
+    (tmp_path / "grid.yml").write_text("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0, 1, 2]\n")
+    command = [sys.executable, "-u", "-m", "sb3_por", "suite", tmp_path / "grid.yml", "--dry-run"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == "" and process.wait() == 141
+
+
 def test_evaluate_prints_a_line(run, capsys):
     assert main(["evaluate", "--model", str(run / "best_model.zip"), "--env", "Pendulum-v1", "-n", "1"]) == 0
     line = capsys.readouterr().out

@@ -351,9 +351,9 @@ class VisualActorCritic(Algorithm):
         return norms
 
     def _record_metrics(self) -> None:
-        """Move the means since the last time to the logger: the one place that waits for the device."""
+        """Hand the means since the last time to the logger, which averages them until it writes: the one place that waits."""
         for name, values in self._metrics.items():
-            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+            self.logger.record_mean(f"train/{name}", th.stack(values).mean().item())
         self._metrics.clear()
 
     def dump_logs(self) -> None:

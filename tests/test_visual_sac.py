@@ -170,6 +170,17 @@ def test_logs_objective_control_and_gradient_norms():
     assert logged["train/encoder_grad_norm_por"] > 0
 
 
+def test_what_is_logged_is_the_mean_of_all_updates_since_the_last_time():
+    model, values = make_model(SACPOR), iter([1.0, 3.0, 8.0])
+    model._update = lambda batch_size: model._metrics["value"].append(th.tensor(next(values)))
+    model.train(1, 8)
+    model.train(1, 8)
+    assert model.logger.name_to_value["train/value"] == 2.0
+    model.logger.dump()
+    model.train(1, 8)
+    assert model.logger.name_to_value["train/value"] == 8.0
+
+
 def test_diagnostics_do_not_change_the_gradient():
     parameters = []
     for interval in (1, 10_000):

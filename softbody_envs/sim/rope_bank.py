@@ -1,7 +1,7 @@
 """
 The crumpled ropes that episodes start from.
 
-``python -m softbody_envs.sim.rope_bank`` makes them anew (four minutes) and overwrites the file that the package ships.
+``python -m softbody_envs.sim.rope_bank`` makes them anew (15 minutes) and overwrites the file that the package ships.
 """
 
 from functools import cache
@@ -16,8 +16,6 @@ from softbody_envs.sim.world import World
 from softbody_envs.variations import N_VARIATIONS, variation_rng
 
 PATH = files("softbody_envs.sim") / "rope_bank.npz"
-#: Variations that start from the same crumpled rope, turned and mirrored; none of them is in the other split.
-VARIATIONS_PER_STATE = 4
 #: Positions are kept as whole multiples of this, m.
 RESOLUTION = 1e-5
 #: SoftGym's recipe: so often, some node is pulled for 0.6 s at 0.5 m/s along each axis at most, then dropped.
@@ -45,13 +43,12 @@ def _bank() -> np.ndarray:
 def crumpled(variation: int, rng: np.random.Generator) -> np.ndarray:
     """
     :param variation: 0..999
-    :param rng: draws the turn about the z axis and whether to mirror
+    :param rng: draws the turn about the z axis
     :return: nodes of a rope at rest on the floor, its bounding box centred on the z axis, m, ``(N_NODES, 3)``
     """
-    nodes = _bank()[variation // VARIATIONS_PER_STATE] * RESOLUTION
+    nodes = _bank()[variation] * RESOLUTION
     cos, sin = np.cos(yaw := rng.uniform(-np.pi, np.pi)), np.sin(yaw)
-    mirror = rng.choice([-1.0, 1.0])
-    return _centred(nodes @ np.array([[cos, sin, 0.0], [-mirror * sin, mirror * cos, 0.0], [0.0, 0.0, 1.0]]))
+    return _centred(nodes @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]))
 
 
 def _centred(nodes: np.ndarray) -> np.ndarray:
@@ -115,13 +112,13 @@ def _shows_its_ends(nodes: np.ndarray) -> bool:
 
 def main() -> None:
     """Make the bank."""
-    bank = np.empty((N_VARIATIONS // VARIATIONS_PER_STATE, N_NODES, 3), dtype=np.int16)
+    bank = np.empty((N_VARIATIONS, N_NODES, 3), dtype=np.int16)
     world = World(STEPS_PER_CONTROL)
-    for state in trange(len(bank)):
-        rng = variation_rng("rope bank", state)
+    for variation in trange(N_VARIATIONS):
+        rng = variation_rng("rope bank", variation)
         while (nodes := crumple(world, rng)) is None:
             pass
-        bank[state] = np.rint(nodes / RESOLUTION)
+        bank[variation] = np.rint(nodes / RESOLUTION)
     np.savez_compressed(str(PATH), nodes=bank)
 
 

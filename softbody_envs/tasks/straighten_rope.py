@@ -68,10 +68,9 @@ class StraightenRopeEnv(SoftbodyEnv):
 
     ## Starting State
 
-    One of 250 ropes at rest, each made as in SoftGym: four times, some node of a straight rope is pulled for 0.6 s in a random
-    direction and dropped. A variation turns the rope by a random angle, may mirror it, and centres it. The ends are at most
-    0.35 m apart and nothing lies on them. The pickers are 10 cm above the floor, 4 cm to either side of the middle. Training
-    and held-out variations share no rope.
+    A rope at rest, made as in SoftGym: four times, some node of a straight rope is pulled for 0.6 s in a random
+    direction and dropped. Each variation has a rope of its own, turned by a random angle and centred. The ends are at most
+    0.35 m apart and nothing lies on them. The pickers are 10 cm above the floor, 4 cm to either side of the middle.
 
     ## Episode End
 

@@ -22,12 +22,17 @@ def common(trial: optuna.Trial) -> dict[str, Any]:
     }
 
 
+def _weight(trial: optuna.Trial, name: str) -> float:
+    """Of an objective beside the critic's loss, which grows with the square of ``reward_scale``: 400 times in our settings."""
+    return trial.suggest_float(name, 0.1, 1000.0, log=True)
+
+
 def partial_order(trial: optuna.Trial) -> dict[str, Any]:
     """
     :return: lambda, m (of 50 features), k, pairing and head of the partial-order objective
     """
     return {
-        "por_coef": trial.suggest_float("por_coef", 0.01, 1.0, log=True),
+        "por_coef": _weight(trial, "por_coef"),
         "order_dim": trial.suggest_categorical("order_dim", [1, 5, 10, 25, 40]),
         "k": trial.suggest_int("k", 1, 5),
         "random_k": trial.suggest_categorical("random_k", [False, True]),
@@ -50,7 +55,7 @@ def contrastive(trial: optuna.Trial) -> dict[str, Any]:
     """
     :return: weight of CURL's loss
     """
-    return {"curl_coef": trial.suggest_float("curl_coef", 0.01, 1.0, log=True)}
+    return {"curl_coef": _weight(trial, "curl_coef")}
 
 
 def self_predictive(trial: optuna.Trial) -> dict[str, Any]:
@@ -58,7 +63,7 @@ def self_predictive(trial: optuna.Trial) -> dict[str, Any]:
     :return: weight and horizon of SPR's loss
     """
     return {
-        "spr_coef": trial.suggest_float("spr_coef", 0.01, 2.0, log=True),
+        "spr_coef": _weight(trial, "spr_coef"),
         "horizon": trial.suggest_int("horizon", 1, 5),
     }
 

@@ -42,7 +42,7 @@ from sb3_por.runs import current_commit, current_machine, read_settings, run_arg
 from sb3_por.search_spaces import sampler
 
 EXAMPLE = """example:
-  python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:0.1 pairing:paper
+  python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:10.0 pairing:paper
 
   python train.py --resume logs/sac_por/PourWater-v0_1
 

@@ -36,9 +36,9 @@ class Command:
     run: Callable[[argparse.Namespace], object]
 
 
-def _model_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--model", required=True, help="a .zip, a run folder (its best_model.zip), random, or expert")
-    parser.add_argument("--env", required=True, help="environment id")
+def _model_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    parser.add_argument("--model", required=required, help="a .zip, a run folder (its best_model.zip), random, or expert")
+    parser.add_argument("--env", required=required, help="environment id")
     parser.add_argument("--algo", help="algorithm that saved the model, if it cannot be told from the file")
 
 
@@ -142,15 +142,30 @@ def _plot(args: argparse.Namespace) -> None:
 
 
 def _diagnose_arguments(parser: argparse.ArgumentParser) -> None:
-    _model_arguments(parser)
+    runs = "instead of --model and --env: make a table of the last models of all runs in there that learn an order"
+    parser.add_argument("paths", nargs="*", metavar="RUN_OR_FOLDER", help=runs)
+    parser.add_argument("--csv", help="write that table here, too")
+    _model_arguments(parser, required=False)
     parser.add_argument("-n", "--n-episodes", type=int, default=5, help="held-out episodes of each policy (default 5)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
 def _diagnose(args: argparse.Namespace) -> None:
-    from sb3_por.diagnostics import check_order, diagnose
+    import softbody_envs  # noqa: F401  (registers its ids)
+    from sb3_por.diagnostics import check_order, diagnose, diagnose_runs
+    from sb3_por.files import check_output
 
+    if args.csv:
+        check_output(args.csv, (".csv",))
+    if args.paths:
+        table = diagnose_runs(args.paths, args.n_episodes, args.seed)
+        if args.csv:
+            table.to_csv(args.csv, index=False, float_format="%.5g")
+        print(table.to_json(orient="records", indent=2) if args.json else table.round(3).to_string(index=False))
+        return
+    if args.model is None or args.env is None:
+        raise UserError("say which model: --model and --env, or folders of runs (diagnose --help lists the arguments)")
     model, vec_normalize = _load(args)
     check_order(model)
     diagnosis = diagnose(model, args.env, args.n_episodes, args.seed, vec_normalize)

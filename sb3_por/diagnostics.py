@@ -1,10 +1,13 @@
 """What a trained objective has learned: order or encoder identity, and whether its potential follows the physics."""
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch as th
 from scipy.stats import ConstantInputWarning, spearmanr
 from stable_baselines3.common.utils import set_random_seed
@@ -12,8 +15,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.errors import UserError
 from sb3_por.evaluation import evaluation_episodes, make_evaluation_env
+from sb3_por.loading import load_model, vec_normalize_file
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.replay import SequenceReplayBuffer
+from sb3_por.runs import find_runs, is_finished
+from sb3_por.scores import run_identity
 
 #: Pairs of a batch, and batches that a number is the mean of.
 BATCH_SIZE, N_BATCHES = 256, 4
@@ -125,6 +131,33 @@ def diagnose(model: Any, env_id: str, n_episodes: int = 5, seed: int = 0, vec_no
         correlation=float(np.mean(changing)) if changing else float("nan"),
         correlations=correlations,
     )
+
+
+def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int = 0) -> pd.DataFrame:
+    """
+    Diagnose the last model of every run that learns an order; other runs and unfinished ones are passed over.
+
+    :param folders: run folders, or folders that hold some at any depth
+    :param n_episodes: as in :func:`diagnose`
+    :param seed: as in :func:`diagnose`
+    :return: one row a model: env, algo (or label), seed, step, and what a ``Diagnosis`` holds but single episodes
+    :raises UserError: if there is no such model
+    """
+    rows = []
+    for run in find_runs(folders):
+        identity = run_identity(run)
+        file = run / f"{identity['env']}.zip"
+        if not is_finished(run, identity["env"]):
+            continue
+        model: Any = load_model(file)
+        if not isinstance(getattr(model.policy, "objective", None), PartialOrder):
+            continue
+        measured = diagnose(model, identity["env"], n_episodes, seed, vec_normalize_file(file, identity["env"])).as_dict()
+        del measured["correlations"]
+        rows.append({**identity, "step": model.num_timesteps, **measured})
+    if not rows:
+        raise UserError("none of these runs has ended with a model that learns an order; give runs of sac_por or tqc_por")
+    return pd.DataFrame(rows).sort_values(["env", "algo", "seed"], ignore_index=True)
 
 
 def _play(model: Any, env: VecEnv, episodes: list[Any], at_random: bool) -> tuple[SequenceReplayBuffer, list[float]]:

@@ -1,6 +1,7 @@
 """Diagnosis and saliency: what they measure is right where the answer is known, and they refuse what has no order."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -9,11 +10,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from made_runs import write_run
 from stable_baselines3 import SAC
 
 from sb3_por import SACPOR
-from sb3_por.diagnostics import diagnose
+from sb3_por.__main__ import main
+from sb3_por.diagnostics import diagnose, diagnose_runs
 from sb3_por.errors import UserError
+from sb3_por.loading import load_model
 from sb3_por.saliency import overlay, saliency_map
 
 
@@ -91,3 +95,20 @@ def test_commands_write_json_and_a_picture(model_file, tmp_path):
     picture = tmp_path / "map.png"
     subprocess.run([*command, "saliency", *of_model, "-o", str(picture), "--step", "5"], check=True, capture_output=True)
     assert cv2.imread(str(picture)).shape == (480, 960, 3)
+
+
+def test_runs_become_a_table_of_what_their_classifiers_learned(model_file, tmp_path, capsys):
+    run = write_run(tmp_path, env="FallingBall-v0", seed=3, label="mine")
+    shutil.copy(model_file, run / "FallingBall-v0.zip")
+    write_run(tmp_path / "unfinished", env="FallingBall-v0", seed=4)
+    other = write_run(tmp_path, algo="sac", env="Pendulum-v1", seed=3)
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10).save(other / "Pendulum-v1.zip")
+    table = diagnose_runs([tmp_path], n_episodes=1)
+    assert table[["env", "algo", "seed", "step"]].to_numpy().tolist() == [["FallingBall-v0", "mine", 3, 80]]
+    expected = diagnose(load_model(run / "FallingBall-v0.zip"), "FallingBall-v0", n_episodes=1)
+    assert (table["leak_loss"].item(), table["correlation"].item()) == (expected.leak_loss, expected.correlation)
+    assert main(["diagnose", str(tmp_path), "-n", "1", "--csv", str(tmp_path / "table.csv")]) == 0
+    assert "mine" in capsys.readouterr().out and (tmp_path / "table.csv").read_text().startswith("env,algo,seed,step,loss,")
+    with pytest.raises(UserError, match="none of these runs has ended with a model that learns an order"):
+        diagnose_runs([other])
+    assert main(["diagnose", "--env", "FallingBall-v0"]) == 2 and "say which model" in capsys.readouterr().err

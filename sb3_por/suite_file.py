@@ -126,9 +126,9 @@ _EXAMPLES = {
     "algos": "[sac_por, sac]",
     "envs": "[PourWater-v0]",
     "seeds": "[0, 1, 2]",
-    "hyperparams": "{por_coef: 0.1}",
+    "hyperparams": "{batch_size: 128}",
     "variants": "{por_paper: {algo: sac_por, pairing: paper}}",
-    "overrides": "{sac_por: {por_coef: 0.1}}",
+    "overrides": "{sac_por: {k: 3}}",
 }
 _REQUIRED = ("algos", "envs", "seeds")
 

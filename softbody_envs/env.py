@@ -13,8 +13,10 @@ from softbody_envs.sim.world import CONTROL_PERIOD, World
 from softbody_envs.variations import SPLITS, check_variation, variation_rng
 
 OBS_TYPES = ("pixels", "state", "dict")
-#: Bound of every element of a state vector (m, rad, or a fraction); a value beyond it is clipped.
+#: Bound of every element of a state vector, in the units of its task's page; a value beyond it is clipped.
 STATE_LIMIT = 10.0
+#: Rounding errors do not decide whether an episode is a success.
+TOLERANCE = 1e-9
 
 
 class SoftbodyEnv(gym.Env, EzPickle, ABC):
@@ -82,6 +84,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.action_size,), np.float32)
 
         self._world: World | None = None
+        self._faulty = False
         self.variation = -1  # none before the first reset
         self._initial_performance = 0.0
 
@@ -97,7 +100,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
 
     @abstractmethod
     def _measure(self) -> np.ndarray:
-        """The elements of ``state_names`` now, in m, rad and fractions."""
+        """The elements of ``state_names`` now, in the units of the task's page."""
 
     @abstractmethod
     def performance(self) -> float:
@@ -137,13 +140,12 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
             split = SPLITS[self.split]
             self.variation = int(self.np_random.integers(split.start, split.stop))
         if self._world is None:
-            self._world = World(self.steps_per_control, self.deformable)
-            self.renderer.attach(self._world)
+            self._world = self._open()
+        self._faulty = False
         self.world.clear()
         self._build(self.world, variation_rng(type(self).__name__, self.variation))
         self._initial_performance = self.performance()
-        self._last_sound = self._observation(), float(self.reward()), self._info()
-        observation, _, info = self._last_sound
+        observation, _, info = self._outcome()
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -164,17 +166,22 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
             # Positions mean nothing any more: repeat the last sound step, end the episode, and start the next one
             # from a fresh client.
             self.close()
-            observation, reward, info = copy.deepcopy(self._last_sound)
+            self._faulty = True
+            observation, reward, info = self._last_sound
             return observation, reward, False, True, info | {"sim_error": fault}
-        self._last_sound = self._observation(), float(self.reward()), self._info()
-        observation, reward, info = self._last_sound
+        observation, reward, info = self._outcome()
         return observation, reward, False, False, info
 
     def render(self) -> np.ndarray | None:
-        """An RGB image, uint8 ``(render_size, render_size, 3)``, if ``render_mode`` is ``"rgb_array"``."""
+        """
+        An RGB image, uint8 ``(render_size, render_size, 3)``, if ``render_mode`` is ``"rgb_array"``; a black one after a
+        simulation that failed, of which nothing is left to draw.
+        """
         if self.render_mode is None:
             gym.logger.warn('render() returns nothing: make the environment with render_mode="rgb_array"')
             return None
+        if self._faulty:
+            return np.zeros((self.render_size, self.render_size, 3), np.uint8)
         return self._image(self.render_size)
 
     def close(self) -> None:
@@ -194,6 +201,16 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
             raise gym.error.ResetNeeded("call reset() first")
         return self._world
 
+    def _open(self) -> World:
+        """A new world, which the renderer knows."""
+        world = World(self.steps_per_control, self.deformable)
+        try:
+            self.renderer.attach(world)
+        except BaseException:
+            world.close()
+            raise
+        return world
+
     # -- derived ---------------------------------------------------------------------------------------------------
 
     def state(self) -> np.ndarray:
@@ -211,12 +228,18 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         image = self._image(self.image_size)
         return image if self.obs_type == "pixels" else {"image": image, "state": self.state()}
 
+    def _outcome(self) -> tuple[Any, float, dict[str, Any]]:
+        """Observation, reward and info of now, remembered in case that the next step fails."""
+        outcome = self._observation(), float(self.reward()), self._info()
+        self._last_sound = copy.deepcopy(outcome)  # the caller may change what it gets
+        return outcome
+
     def _info(self) -> dict[str, Any]:
         normalized = float(self.normalized_performance())
         return {
             "performance": float(self.performance()),
             "normalized_performance": normalized,
-            "is_success": bool(normalized >= self.success_threshold),
+            "is_success": bool(normalized >= self.success_threshold - TOLERANCE),
             "monotone": float(self.monotone()),
             "variation": self.variation,
         }

@@ -117,11 +117,9 @@ def test_episode_ends_at_the_horizon_by_truncation_and_every_state_element_varie
 
 def _expert(env_id):
     try:
-        expert = make_expert(env_id)
+        return make_expert(env_id)
     except ValueError:  # the diagnostics have nothing to solve
         return None
-    expert.reset()
-    return expert
 
 
 # -- determinism -------------------------------------------------------------------------------------------------------
@@ -250,6 +248,26 @@ def test_step_and_render_before_reset_say_so(env_id):
     for call in (lambda: env.step(env.action_space.sample()), env.render):
         with pytest.raises(gym.error.ResetNeeded):
             call()
+
+
+def test_a_renderer_that_fails_is_never_replaced_by_another(monkeypatch):
+    def attach(world):
+        raise RuntimeError("no driver")
+
+    env = make("FallingBall-v0").unwrapped
+    monkeypatch.setattr(env.renderer, "attach", attach)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="no driver"):
+            env.reset()
+
+
+def test_rounding_does_not_decide_on_success(monkeypatch):
+    env = make("PourWaterAmount-v0").unwrapped
+    env.reset(options={"variation": 0})
+    monkeypatch.setattr(env, "normalized_performance", lambda: 1 - 0.1 - 1e-16)
+    assert env._info()["is_success"]
+    monkeypatch.setattr(env, "normalized_performance", lambda: 0.899)
+    assert not env._info()["is_success"]
 
 
 @pytest.mark.parametrize("argument", ["obs_type", "split", "renderer", "render_mode"])

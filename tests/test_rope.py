@@ -222,9 +222,27 @@ def test_failed_simulation_ends_the_episode_and_the_next_one_is_sound(env):
     _, _, terminated, truncated, info = env.step(IDLE)
     assert truncated and not terminated
     assert "rope" in info["sim_error"]
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(IDLE)
     env.reset(options={"variation": 0})
     _, _, _, truncated, info = env.step(IDLE)
     assert not truncated and "sim_error" not in info
+
+
+def test_a_failed_simulation_repeats_what_was_last_sound_and_draws_black():
+    env = gym.make("StraightenRope-v0", obs_type="state", render_mode="rgb_array", render_size=32).unwrapped
+    env.reset(options={"variation": 0})
+    state, reward, _, _, info = env.step(IDLE)
+    kept = state.copy()
+    state[:], info["performance"] = 7.0, 7.0  # ours to change
+    env.world.client.resetBasePositionAndOrientation(env.rope._segments[5], (5.0, 0.0, 1.0), (0, 0, 0, 1))
+    repeated, again, _, truncated, last = env.step(IDLE)
+    assert truncated and again == reward and last["performance"] != 7.0
+    np.testing.assert_array_equal(repeated, kept)
+    assert env.render().shape == (32, 32, 3) and not env.render().any()
+    env.reset()
+    assert env.render().any()
+    env.close()
 
 
 def test_failure_names_what_is_wrong():

@@ -64,6 +64,9 @@ class PourWaterExpert:
 class PourWaterAmountExpert(PourWaterExpert):
     """Tilts quickly to just before the wanted share leaves the cup, then little by little, and back as soon as it has left."""
 
+    def __init__(self) -> None:
+        self.reset()
+
     def reset(self) -> None:
         """Forget what had left the cup."""
         self._left = 0.0

@@ -15,6 +15,9 @@ APART = 0.01
 class StraightenRopeExpert:
     """Each picker goes to the end that is nearer, both grasp, and then they part in the direction in which the ends lie."""
 
+    def __init__(self) -> None:
+        self.reset()
+
     def reset(self) -> None:
         """Forget which picker is for which end."""
         self._swapped: bool | None = None

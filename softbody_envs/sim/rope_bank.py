@@ -18,7 +18,7 @@ from softbody_envs.variations import N_VARIATIONS, variation_rng
 PATH = files("softbody_envs.sim") / "rope_bank.npz"
 #: Positions are kept as whole multiples of this, m.
 RESOLUTION = 1e-5
-#: SoftGym's recipe: so often, some node is pulled for 0.6 s at 0.5 m/s along each axis at most, then dropped.
+#: SoftGym's recipe: so often, some node is pulled for 0.64 s at up to 0.5 m/s to the sides and 1 m/s upward, then dropped.
 PULLS = 4
 PULL_STEPS = 8
 PULL_SPEED = 0.04

@@ -67,6 +67,8 @@ class FoldClothEnv(SoftbodyEnv):
     | 20 to 25 | x, y, z of the corner of the edge to carry that each picker starts nearer to, seen from that picker | 0.08 m |
     | 26 to 31 | x, y, z of the corners where those belong, seen from them | 0.08 m |
 
+    Elements are clipped at their bounds: what is farther than 0.8 m, elements 20 to 31 do not tell.
+
     ## Rewards
 
     Each step: -(d + 1.2 f). d is the mean distance between a node of the carried half and its mirror image in the other

@@ -83,7 +83,7 @@ class PourWaterEnv(SoftbodyEnv):
 
     * Spheres of 2 cm instead of some thousand FleX particles: coarse water, which leaves a tilted cup in surges.
     * The cup keeps one particle's diameter from the target, and spilled water falls into a sink 10 cm lower: nothing can
-      be pressed through a wall. SoftGym lets cups touch and leaves the water on the table.
+      be pressed through a wall. SoftGym refuses only the touch itself, and leaves the water on the table.
     * A pose has limits, so that the cup stays in the image.
     * Element 6 of the state is the target's place; SoftGym adds the cup's to it.
     * Whether water is in a tilted cup is asked in the cup's frame; SoftGym takes an upright box.

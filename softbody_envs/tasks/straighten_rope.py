@@ -68,7 +68,7 @@ class StraightenRopeEnv(SoftbodyEnv):
 
     ## Starting State
 
-    A rope at rest, made as in SoftGym: four times, some node of a straight rope is pulled for 0.6 s in a random
+    A rope at rest, made as in SoftGym: four times, some node of a straight rope is pulled for 0.64 s in a random
     direction and dropped. Each variation has a rope of its own, turned by a random angle and centred. The ends are at most
     0.35 m apart and nothing lies on them. The pickers are 10 cm above the floor, 4 cm to either side of the middle.
 

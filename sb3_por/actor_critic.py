@@ -139,6 +139,9 @@ class VisualActorCritic(Algorithm):
                 # SB3 knows its own buffers only
                 warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
+        if isinstance(self.replay_buffer, SequenceReplayBuffer):
+            # Set, it would make SB3 end the episode that a second learn() cuts off
+            self.optimize_memory_usage = False
         self._check_buffer()
         if self.device.type == "cpu":
             keep_freed_memory()
@@ -428,11 +431,12 @@ class VisualActorCritic(Algorithm):
         :param exclude: Names of attributes to leave out
         :param include: Names of attributes to save although they are left out by default
         """
-        self.rng_state = get_rng_state(self.action_space)
+        loaded = self.rng_state  # of a model that was loaded and has not learned since
+        self.rng_state = loaded or get_rng_state(self.action_space)
         try:
             super().save(path, exclude, include)
         finally:
-            self.rng_state = None
+            self.rng_state = loaded
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_metrics", "_preparation"]

@@ -10,7 +10,9 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_por.files import atomic_write
@@ -105,6 +107,10 @@ def restore_buffer(model: BaseAlgorithm, checkpoint: Path) -> None:
     buffer.device = model.device
     if isinstance(buffer, HerReplayBuffer) and model.env is not None:
         buffer.set_env(model.env)
+    if type(buffer) is NStepReplayBuffer and buffer.size() > 0:
+        # The environment starts anew: returns of several steps must not run on into that episode. Our buffer knows.
+        last = buffer.pos - 1
+        buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])
     model.replay_buffer = buffer  # type: ignore[attr-defined]
 
 

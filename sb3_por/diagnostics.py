@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import torch as th
 from scipy.stats import ConstantInputWarning, spearmanr
-from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.utils import obs_as_tensor, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.errors import UserError
@@ -171,12 +171,12 @@ def _play(model: Any, env: VecEnv, episodes: list[Any], at_random: bool) -> tupl
     while len(correlations) < len(episodes):
         action = np.array([env.action_space.sample()]) if at_random else model.predict(observation, deterministic=True)[0]
         next_observation, reward, done, infos = env.step(action)
-        last = infos[0]["terminal_observation"][None] if done[0] else next_observation
+        last = _batch(infos[0]["terminal_observation"]) if done[0] else next_observation
         transitions.append((observation, last, model.policy.scale_action(action), reward, done, infos))
         frames.append(last)
         monotone.append(infos[0].get("monotone", np.nan))
         if done[0]:
-            correlations.append(_correlation(model, np.concatenate(frames), np.array(monotone)))
+            correlations.append(_correlation(model, frames, np.array(monotone)))
             frames, monotone = [next_observation], [env.unwrapped.reset_infos[0].get("monotone", np.nan)]
         observation = next_observation
     buffer = SequenceReplayBuffer(
@@ -187,10 +187,22 @@ def _play(model: Any, env: VecEnv, episodes: list[Any], at_random: bool) -> tupl
     return buffer, correlations
 
 
-def _correlation(model: Any, frames: np.ndarray, monotone: np.ndarray) -> float:
+def _batch(observation: Any) -> Any:
+    """A batch of one observation."""
+    return {key: value[None] for key, value in observation.items()} if isinstance(observation, dict) else observation[None]
+
+
+def _concatenate(batches: list[Any]) -> Any:
+    """One batch of many."""
+    if isinstance(batches[0], dict):
+        return {key: np.concatenate([batch[key] for batch in batches]) for key in batches[0]}
+    return np.concatenate(batches)
+
+
+def _correlation(model: Any, frames: list[Any], monotone: np.ndarray) -> float:
     """Spearman's correlation over one episode; NaN where the quantity does not change."""
     with th.no_grad():
-        features = model.critic.encode(th.as_tensor(frames, device=model.device))
+        features = model.critic.encode(obs_as_tensor(_concatenate(frames), model.device))
         potential = model.policy.objective.potential(features).cpu().numpy()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConstantInputWarning)

@@ -15,10 +15,11 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from sb3_por import ALGORITHMS
 from sb3_por.files import atomic_write, check_output
 
-#: Okabe and Ito's colours, told apart by readers with any colour vision; line styles and markers for print in grey.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#E69F00")
-STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)))
-MARKERS = ("o", "s", "^", "D", "v", "p", "h")
+#: Okabe and Ito's colours, told apart by readers with any colour vision (brown for their yellow, which is faint on white);
+#: line styles and markers for print in grey.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#E69F00", "#8C510A")
+STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), (0, (8, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "p", "h", "X")
 FORMATS = (".png", ".pdf", ".svg")
 #: An algorithm looks the same in every figure, whoever stands beside it: these have the first looks, others the next.
 KNOWN = [*ALGORITHMS, "sac"]
@@ -37,7 +38,7 @@ class Look(NamedTuple):
 
 
 def looks(algos: Iterable[str]) -> dict[str, Look]:
-    """The look of each algorithm; 49 are told apart."""
+    """The look of each algorithm; 64 are told apart."""
     names = list(dict.fromkeys([*KNOWN, *sorted(algos)]))
     n = len(COLORS)
     return {name: Look(COLORS[i % n], STYLES[(i + i // n) % n], MARKERS[(i + i // n) % n]) for i, name in enumerate(names)}
@@ -84,9 +85,19 @@ def panels(n: int, height: float) -> tuple[Figure, list[Axes]]:
 
 def curve(axes: Axes, x: pd.Series, y: pd.Series, low: pd.Series, high: pd.Series, look: Look, label: str) -> None:
     """A line in its band."""
+    strong(axes, x, y, look, label)
+    axes.fill_between(x, low, high, color=look.color, alpha=0.18, linewidth=0)
+
+
+def strong(axes: Axes, x: pd.Series, y: pd.Series, look: Look, label: str) -> None:
+    """A line with markers."""
     every = -(-len(x) // N_MARKERS)
     axes.plot(x, y, label=label, color=look.color, linestyle=look.style, marker=look.marker, markevery=every)
-    axes.fill_between(x, low, high, color=look.color, alpha=0.18, linewidth=0)
+
+
+def faint(axes: Axes, x: pd.Series, y: pd.Series, look: Look, label: str) -> None:
+    """A thin line for what a curve is compared with."""
+    axes.plot(x, y, label=label, color=look.color, linestyle=look.style, alpha=0.5, linewidth=1)
 
 
 def interval(axes: Axes, row: int, value: float, low: float, high: float, look: Look) -> None:

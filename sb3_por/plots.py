@@ -7,7 +7,20 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_por.drawing import Look, curve, interval, legend_below, looks, name_rows, one_panel, panels, steps_axis, style
+from sb3_por.drawing import (
+    Look,
+    curve,
+    faint,
+    interval,
+    legend_below,
+    looks,
+    name_rows,
+    one_panel,
+    panels,
+    steps_axis,
+    strong,
+    style,
+)
 from sb3_por.grids import in_order
 from sb3_por.order_logs import GRADIENT_METRICS
 
@@ -162,11 +175,11 @@ def draw_order(table: pd.DataFrame) -> Figure:
                     curve(axes, rows["step"], rows["mean"], low, high, by_algo[algo], algo)
                 for algo, rows in _algos(here[here["metric"] == metric.replace("por_", "por_leak_")]):
                     look, label = by_algo[algo], f"{algo}, a frame and itself"
-                    axes.plot(rows["step"], rows["mean"], color=look.color, alpha=0.5, linewidth=1, label=label)
+                    faint(axes, rows["step"], rows["mean"], look, label)
                 axes.axhline(chance, color="0.3", linewidth=1, linestyle=(0, (1, 2)), label="chance")
                 axes.text(1, chance, name, transform=axes.get_yaxis_transform(), va="bottom", ha="right", color="0.3")
                 axes.set_ylabel(LABELS[metric])
-                axes.set_ylim(*limits)
+                axes.set_ylim(limits[0], max(limits[1], axes.dataLim.y1 + 0.02))
             grid[0, j].set_title(env)
             steps_axis(grid[-1, j])
         legend_below(figure, grid.ravel(), _spread(table))
@@ -174,11 +187,10 @@ def draw_order(table: pd.DataFrame) -> Figure:
 
 
 def _gradients(axes: Axes, table: pd.DataFrame, by_algo: dict[str, Look]) -> None:
-    """How hard each loss pulls at the encoder: means over seeds, the critic's dotted."""
-    for metric, dash in zip(GRADIENT_METRICS, (":", "-"), strict=True):
+    """How hard each loss pulls at the encoder: means over seeds, the critic's faint."""
+    for metric, draw in zip(GRADIENT_METRICS, (faint, strong), strict=True):
         for algo, rows in _algos(table[table["metric"] == metric]):
-            label = f"{algo}, {LABELS[metric]}"
-            axes.plot(rows["step"], rows["mean"], color=by_algo[algo].color, linestyle=dash, linewidth=1.5, label=label)
+            draw(axes, rows["step"], rows["mean"], by_algo[algo], f"{algo}, {LABELS[metric]}")
     axes.set_yscale("log", nonpositive="mask")
     axes.set_ylabel("gradient norm at the encoder")
 

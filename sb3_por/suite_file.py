@@ -110,8 +110,12 @@ def suite_runs(suite: Suite, root: Path) -> list[Run]:
             for name in suite.algos:
                 variant = dict(suite.variants.get(name, {}))
                 algo = variant.pop("algo", name)
-                changes = suite.hyperparams | variant
-                for key in (env, name, f"{name}/{env}"):
+                # From wide to narrow: a variant is its algorithm, overrides and all, but for what makes it one.
+                wide, narrow = (env, algo, f"{algo}/{env}"), (name, f"{name}/{env}") if name in suite.variants else ()
+                changes = dict(suite.hyperparams)
+                for part in (*(suite.overrides.get(key, {}) for key in wide), variant):
+                    changes |= part
+                for key in narrow:
                     changes |= suite.overrides.get(key, {})
                 params = ["-params", *(f"{name}:{value!r}" for name, value in changes.items())] if changes else []
                 flags = [*common, "--num-threads", str(suite.threads), *params]
@@ -182,13 +186,13 @@ class _Checks:
         for name, of_name in nodes.items():
             self._type(of_name, name, values[name])
         if "variants" in nodes:
-            self._variants(nodes["variants"])
+            self._variants(nodes["variants"], values["variants"])
         algos = [*LOADABLE, *values.get("variants", {})]
         for name, kind, known in (("algos", "algorithm", algos), ("envs", "environment", list(gym.registry))):
             for one in nodes[name].value:
                 self._known(one, kind, known)
         if "overrides" in nodes:
-            algos, envs = values["algos"], values["envs"]
+            algos, envs = [*values["algos"], *(one["algo"] for one in values.get("variants", {}).values())], values["envs"]
             for key, _ in nodes["overrides"].value:
                 self._known(key, "run", [*algos, *envs, *(f"{algo}/{env}" for algo in algos for env in envs)])
 
@@ -224,14 +228,18 @@ class _Checks:
         elif type(value) is not int or value < 1:
             self._fail(node, f"{name} must be a positive integer, got {value!r}")
 
-    def _variants(self, node: yaml.MappingNode) -> None:
-        for name, settings in node.value:
-            if name.value in LOADABLE:
-                self._fail(name, f"{name.value} is an algorithm; give the variant another name")
-            algos = [value for key, value in settings.value if key.value == "algo"]
-            if not algos:
-                self._fail(name, f"{name.value} has no algo; write for example variants: {_EXAMPLES['variants']}")
-            self._known(algos[0], "algorithm", list(LOADABLE))
+    def _variants(self, node: yaml.MappingNode, variants: dict[Any, dict[str, Any]]) -> None:
+        for (key, _), (name, settings) in zip(node.value, variants.items(), strict=True):
+            if not _is_name(name):
+                self._fail(key, f"{key.value} is read as {name!r}; write the variant's name in quotes")
+            if name in LOADABLE:
+                self._fail(key, f"{name} is an algorithm; give the variant another name")
+            if "algo" not in settings:
+                self._fail(key, f"{name} has no algo; write for example variants: {_EXAMPLES['variants']}")
+            try:
+                check_known("algorithm", str(settings["algo"]), list(LOADABLE))
+            except UserError as error:
+                self._fail(key, str(error))
 
     def _list(self, node: yaml.Node, name: str, value: Any) -> None:
         is_one = _is_seed if name == "seeds" else _is_name

@@ -219,7 +219,7 @@ class Experiment(ExperimentManager):
         if self._resumed_run is None:
             hyperparams, saved = super().read_hyperparameters()
         else:
-            saved = read_settings(self._resumed_run / self.env_name / "config.yml")
+            saved = read_settings(self._resumed_run / self.env_name / "config.yml") | (self.custom_hyperparams or {})
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         held_out = evaluation_kwargs(self.env_name.gym_id)
@@ -312,6 +312,8 @@ class Experiment(ExperimentManager):
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
             env.seed((self.seed + model.num_timesteps) % 2**32)
+        else:
+            model.rng_state = None  # type: ignore[attr-defined]  # of another run: this one has a seed of its own
         return model
 
     def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> dict[str, Any]:

@@ -57,6 +57,12 @@ def test_a_potential_that_follows_the_ball_has_correlation_one(model, monkeypatc
     assert diagnose(model, "FallingBall-v0", n_episodes=1).correlation < -0.99
 
 
+def test_a_model_that_sees_image_and_state_is_diagnosed_too():
+    env = gym.make("FallingBall-v0", obs_type="dict", image_size=36)
+    model = SACPOR("MultiInputPolicy", env, buffer_size=200, learning_starts=60, batch_size=16, seed=0).learn(70)
+    assert -1 <= diagnose(model, "FallingBall-v0", n_episodes=1).correlation <= 1
+
+
 def test_diagnosis_leaves_the_model_as_it_was(model):
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     diagnose(model, "FallingBall-v0", n_episodes=1)

@@ -56,6 +56,8 @@ def test_what_is_drawn_is_what_is_in_the_table():
 
 
 def test_an_algorithm_looks_the_same_beside_any_others_and_unlike_them():
+    colors = [looks(["por_lambda_0", "por_paper"])[name].color for name in (*KNOWN, "por_lambda_0", "por_paper")]
+    assert len(set(colors)) == len(colors)
     many = looks([*KNOWN, *(f"other{i}" for i in range(20))])
     assert len(set(many.values())) == len(many)
     assert looks(["sac"])["sac"] == looks(["ppo", "sac", "a2c"])["sac"]
@@ -110,6 +112,8 @@ def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
     assert {"POR loss", "POR accuracy", "PourWater-v0", "ln 2", "sac_por"} <= set(texts(one.figure).splitlines())
     gradients = {line.get_label(): line.get_ydata().tolist() for line in one.figure.axes[-1].lines}
     assert gradients["sac_por, critic"] == [10] * 3 and gradients["sac_por, λ POR"] == pytest.approx([0.7, 0.5, 0.3])
+    drawn = [(line.get_color(), line.get_linestyle(), line.get_alpha()) for line in one.figure.axes[-1].lines]
+    assert len(set(drawn)) == len(drawn)
     bare, _ = plot_order(order.drop(columns=GRADIENT_METRICS).reindex(columns=order.columns))
     assert len(bare.figure.axes) == 2
 

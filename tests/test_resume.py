@@ -55,6 +55,13 @@ def test_a_checkpoint_holds_model_buffer_and_generators(tmp_path):
     assert loaded.replay_buffer.pos == 80
 
 
+def test_returns_of_several_steps_end_where_a_run_was_resumed(tmp_path):
+    model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=200, learning_starts=1000, n_steps=3, seed=0).learn(60)
+    folder = save_checkpoint(model, tmp_path, "Pendulum-v1")
+    restore_buffer(model, folder)
+    assert model.replay_buffer.timeouts[:60, 0].tolist() == [0] * 59 + [1]
+
+
 def test_a_sequence_buffer_comes_back_from_its_blocks(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoints, "BLOCK_SIZE", 100)
     model = SACPOR("MlpPolicy", "Pendulum-v1", buffer_size=50, learning_starts=1000, seed=0)
@@ -233,8 +240,10 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again_in_its_folder(tmp
             main([*FLAGS, *flags, *SMALL])
     run = tmp_path / "sac" / "Pendulum-v1_1"
     assert latest_checkpoint(run) is None
-    assert main(["--resume", str(run)]) == 0
-    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 60
+    assert main(["--resume", str(run), "-params", "batch_size:8"]) == 0
+    model = load_model(run / "Pendulum-v1.zip")
+    assert model.num_timesteps == 60 and model.batch_size == 8 and model.learning_starts == 50
+    assert yaml.safe_load((run / "Pendulum-v1" / "config.yml").read_text())["batch_size"] == 8
     assert [path.name for path in (tmp_path / "sac").iterdir()] == ["Pendulum-v1_1"]
 
 

@@ -178,3 +178,21 @@ def test_checkpoints_of_a_run_do_not_disturb_it(tmp_path):
 
 def test_same_seed_same_run():
     assert_same_model(make_model(SACPOR, make_env()).learn(60), make_model(SACPOR, make_env()).learn(60))
+
+
+def test_a_model_saved_before_it_goes_on_keeps_the_generators_it_was_loaded_with(tmp_path):
+    model = make_model(SACPOR, make_env()).learn(60)
+    model.save(tmp_path / "model.zip")
+    loaded = SACPOR.load(tmp_path / "model.zip", env=make_env())
+    th.manual_seed(99)
+    loaded.save(tmp_path / "copy.zip")
+    copied = SACPOR.load(tmp_path / "copy.zip")
+    fresh = SACPOR.load(tmp_path / "model.zip")
+    assert np.array_equal(loaded.rng_state["torch"], fresh.rng_state["torch"])
+    assert np.array_equal(copied.rng_state["torch"], fresh.rng_state["torch"])
+
+
+def test_a_second_learn_does_not_end_the_episode_that_it_cuts_off():
+    model = make_model(SACPOR, make_env(), optimize_memory_usage=True).learn(20)
+    model.learn(20, reset_num_timesteps=False)
+    assert not model.replay_buffer.dones[9].any()  # where the first call ended, half-way through an episode

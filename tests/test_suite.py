@@ -58,12 +58,13 @@ def test_a_variant_is_an_algorithm_with_settings_and_a_name(suite_file, tmp_path
     suite = read_suite(
         suite_file(
             "algos: [sac_por, por_paper]\nenvs: [PourWater-v0]\nseeds: [0]\nhyperparams: {pairing: swap, k: 2}\n"
-            "variants:\n  por_paper: {algo: sac_por, pairing: paper}\noverrides: {por_paper: {k: 3}}\n"
+            "variants:\n  por_paper: {algo: sac_por, pairing: paper}\n"
+            "overrides: {PourWater-v0: {pairing: swap}, sac_por: {gamma: 0.9}, por_paper: {k: 3}}\n"
         )
     )
     plain, variant = suite_runs(suite, tmp_path)
-    assert plain.flags[-2:] == ("pairing:'swap'", "k:2") and "--label" not in plain.command()
-    assert variant.flags[-2:] == ("pairing:'paper'", "k:3")
+    assert plain.flags[-3:] == ("pairing:'swap'", "k:2", "gamma:0.9") and "--label" not in plain.command()
+    assert variant.flags[-3:] == ("pairing:'paper'", "k:3", "gamma:0.9")
     assert variant.name == "PourWater-v0/por_paper/seed_0"
     command = " ".join(variant.command())
     assert "--algo sac_por" in command and "--label por_paper" in command
@@ -97,6 +98,10 @@ def test_a_variant_is_an_algorithm_with_settings_and_a_name(suite_file, tmp_path
         ),
         ("algos: [v]\nenvs: [Pendulum-v1]\nseeds: [0]\nvariants: {v: {k: 2}}\n", "grid.yml:4: v has no algo; write for"),
         ("algos: [v]\nenvs: [Pendulum-v1]\nseeds: [0]\nvariants: {v: {algo: sacc}}\n", "grid.yml:4: unknown algorithm 'sacc'"),
+        (
+            "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\nvariants: {off: {algo: sac}}\n",
+            "grid.yml:4: off is read as False; write the variant's name in quotes",
+        ),
         ("algos: [v]\nenvs: [Pendulum-v1]\nseeds: [0]\nvariants: {v: 3}\n", "grid.yml:4: variants must be a mapping"),
         (
             "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\noverrides:\n  sac:\n    gamma: 1\n    gamma: 0.9\n",

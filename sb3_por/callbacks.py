@@ -24,18 +24,34 @@ def is_due(callback: BaseCallback, interval: int) -> bool:
     return callback.num_timesteps // interval > (callback.num_timesteps - n_envs) // interval
 
 
+class Stopwatch:
+    """
+    How long a run has been at work, resumes and all, but not what a killed one did after its last checkpoint.
+
+    :param before: seconds until the checkpoint that it goes on from
+    """
+
+    def __init__(self, before: float = 0.0) -> None:
+        self._before = before
+        self._started = time.monotonic()
+
+    def seconds(self) -> float:
+        return self._before + time.monotonic() - self._started
+
+
 class EvaluationCallback(EvalCallback):
     """
     Plays the same held-out episodes at regular intervals and at the end of training.
 
     Writes ``evaluations.npz`` in SB3's format (``timesteps``, ``results``, ``ep_lengths``, ``successes``) with
-    ``normalized_performance``, of the same shape as ``results``, and ``wall_clock_s`` (since training began); keeps the
+    ``normalized_performance``, of the same shape as ``results``, and ``wall_clock_s`` (that the run took so far); keeps the
     model with the best mean normalized performance as ``best_model.zip``; logs ``eval/*``.
 
     :param eval_env: as :func:`sb3_por.evaluation.run_episodes` takes it
     :param episodes: what to play
     :param eval_freq: interval in environment steps
     :param run: the run's folder
+    :param stopwatch: of the run
     :param callback_on_new_best: called when there is a new best model
     :param verbose: 1: a line an evaluation
     """
@@ -46,6 +62,7 @@ class EvaluationCallback(EvalCallback):
         episodes: list[Episode],
         eval_freq: int,
         run: str | Path,
+        stopwatch: Stopwatch,
         callback_on_new_best: BaseCallback | None = None,
         verbose: int = 1,
     ) -> None:
@@ -61,7 +78,7 @@ class EvaluationCallback(EvalCallback):
         self.episodes = episodes
         self.run = Path(run)
         self._history: dict[str, list[Any]] = {}
-        self._seconds_before = 0.0
+        self.stopwatch = stopwatch
 
     def _init_callback(self) -> None:
         self.run.mkdir(parents=True, exist_ok=True)
@@ -69,7 +86,6 @@ class EvaluationCallback(EvalCallback):
             self.callback_on_new_best.init_callback(self.model)
 
     def _on_training_start(self) -> None:
-        self._started = time.monotonic()
         file = self.run / EVALUATIONS
         if self.num_timesteps > 0 and file.is_file():
             self._take_up(file)
@@ -80,7 +96,6 @@ class EvaluationCallback(EvalCallback):
             kept = arrays["timesteps"] <= self.num_timesteps
             self._history = {name: list(arrays[name][kept]) for name in arrays.files}
         if kept.any():
-            self._seconds_before = float(self._history["wall_clock_s"][-1])
             rows = zip(self._history["normalized_performance"], self._history["results"], strict=True)
             self.best_mean_reward = max(score(performance, returns) for performance, returns in rows)
 
@@ -118,7 +133,7 @@ class EvaluationCallback(EvalCallback):
             "ep_lengths": evaluation.lengths,
             "successes": evaluation.successes,
             "normalized_performance": evaluation.normalized_performance,
-            "wall_clock_s": self._seconds_before + time.monotonic() - self._started,
+            "wall_clock_s": self.stopwatch.seconds(),
         }
         for name, value in row.items():
             self._history.setdefault(name, []).append(value)
@@ -147,11 +162,15 @@ class CheckpointCallback(BaseCallback):
     :param save_freq: interval in environment steps; with 0 only when training is stopped
     :param run: the run's folder
     :param env_id: the environment
+    :param stopwatch: of the run
     :param rng_state: states of the random generators to begin with
     """
 
-    def __init__(self, save_freq: int, run: str | Path, env_id: str, rng_state: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self, save_freq: int, run: str | Path, env_id: str, stopwatch: Stopwatch, rng_state: dict[str, Any] | None = None
+    ) -> None:
         super().__init__()
+        self.stopwatch = stopwatch
         self.save_freq = save_freq
         self.run = Path(run)
         self.env_id = env_id
@@ -168,10 +187,13 @@ class CheckpointCallback(BaseCallback):
             self._n_due = self._count_due()
             with atomic_write(self.run / f"rl_model_{self.model.num_timesteps}_steps.zip") as path:
                 self.model.save(path)
-            save_checkpoint(self.model, self.run, self.env_id)
+            self._save_checkpoint()
         if self.stop_requested:
-            save_checkpoint(self.model, self.run, self.env_id)
+            self._save_checkpoint()
             raise KeyboardInterrupt
+
+    def _save_checkpoint(self) -> None:
+        save_checkpoint(self.model, self.run, self.env_id, self.stopwatch.seconds())
 
     def _on_step(self) -> bool:
         return True

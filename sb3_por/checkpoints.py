@@ -23,7 +23,7 @@ from sb3_por.runs import CHECKPOINTS
 BLOCK_SIZE = 4 * 2**20
 
 
-def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str) -> Path:
+def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: float = 0.0) -> Path:
     """
     Write ``<run>/checkpoint/step_<n>`` and remove older ones. The folder appears when all of it is on disk.
 
@@ -33,6 +33,7 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str) -> Path:
     :param model: the model, between two rollouts
     :param run: the run's folder
     :param env_id: names the folder of ``VecNormalize`` statistics, as in the zoo
+    :param seconds: that the run has taken so far
     :return: the new folder
     """
     root = run / CHECKPOINTS
@@ -45,6 +46,7 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str) -> Path:
     (temporary / "rng.pickle").write_bytes(pickle.dumps(get_rng_state(model.action_space)))
     monitors = {file.name: file.stat().st_size for file in run.glob("*.monitor.csv")}
     (temporary / "monitors.json").write_text(json.dumps(monitors))
+    (temporary / "seconds.json").write_text(json.dumps(seconds))
     used: set[str] = set()
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None:
@@ -117,6 +119,12 @@ def restore_buffer(model: BaseAlgorithm, checkpoint: Path) -> None:
 def read_rng_state(checkpoint: Path) -> dict[str, Any]:
     """The states of the random generators at a checkpoint, for :func:`sb3_por.rng.set_rng_state`."""
     return pickle.loads((checkpoint / "rng.pickle").read_bytes())
+
+
+def read_seconds(checkpoint: Path) -> float:
+    """How long the run had taken at a checkpoint; 0 if it does not say."""
+    file = checkpoint / "seconds.json"
+    return float(json.loads(file.read_text())) if file.is_file() else 0.0
 
 
 def _write_buffer(buffer: Any, folder: Path, blocks: Path) -> set[str]:

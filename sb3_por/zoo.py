@@ -32,8 +32,15 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import ALGORITHMS
-from sb3_por.callbacks import CheckpointCallback, EvaluationCallback
-from sb3_por.checkpoints import latest_checkpoint, read_rng_state, remove_checkpoints, restore_buffer, restore_monitors
+from sb3_por.callbacks import CheckpointCallback, EvaluationCallback, Stopwatch
+from sb3_por.checkpoints import (
+    latest_checkpoint,
+    read_rng_state,
+    read_seconds,
+    remove_checkpoints,
+    restore_buffer,
+    restore_monitors,
+)
 from sb3_por.errors import UserError, check_known, exit_code, one_line
 from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged
 from sb3_por.files import atomic_write, check_writable, remove_unfinished
@@ -290,6 +297,7 @@ class Experiment(ExperimentManager):
         """Our evaluation and checkpoints, counted in environment steps."""
         if self.show_progress:
             self.callbacks.append(ProgressBarCallback())
+        stopwatch = Stopwatch(read_seconds(self._checkpoint) if self._checkpoint else 0.0)
         if self.eval_freq > 0 and not self.optimize_hyperparameters:
             self.callbacks.append(
                 EvaluationCallback(
@@ -297,13 +305,16 @@ class Experiment(ExperimentManager):
                     evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes),
                     self.eval_freq,
                     self.save_path,
+                    stopwatch,
                     callback_on_new_best=SaveVecNormalizeCallback(save_freq=1, save_path=self.params_path),
                     verbose=self.verbose,
                 )
             )
         if not self.optimize_hyperparameters:
             rng_state = read_rng_state(self._checkpoint) if self._checkpoint else None
-            self._checkpoints = CheckpointCallback(self.save_freq, self.save_path, self.env_name.gym_id, rng_state)
+            self._checkpoints = CheckpointCallback(
+                self.save_freq, self.save_path, self.env_name.gym_id, stopwatch, rng_state
+            )
             self.callbacks.append(self._checkpoints)
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:

@@ -195,7 +195,7 @@ def test_a_resumed_run_forgets_the_episodes_that_it_plays_again_and_removes_half
     with monkeypatch.context() as patch:
         patch.setattr("sb3_por.zoo.CheckpointCallback._on_step", die)
         with pytest.raises(RuntimeError, match="killed"):
-            main([*FLAGS, "-n", "360", "--save-freq", "150", "--eval-freq", "-1", "-f", str(tmp_path), *SMALL])
+            main([*FLAGS, "-n", "360", "--save-freq", "150", "--eval-freq", "300", "-f", str(tmp_path), *SMALL])
     run = tmp_path / "sac" / "Pendulum-v1_1"
     monitor = run / "0.monitor.csv"
     with open(monitor, "a") as file:
@@ -207,7 +207,12 @@ def test_a_resumed_run_forgets_the_episodes_that_it_plays_again_and_removes_half
             patch.setattr(Path, "unlink", lambda *_, **__: None)  # as after a kill
             raise SystemExit
     assert unfinished.exists()
+    seconds = run / "checkpoint" / "step_150" / "seconds.json"
+    assert float(seconds.read_text()) > 0
+    seconds.write_text("1000.0")
     assert main(["--resume", str(run)]) == 0
+    with np.load(run / "evaluations.npz") as file:
+        assert 1000 < file["wall_clock_s"][0] < 2000, "the run took 1000 s before"
     rows = monitor.read_text().splitlines()[2:]
     assert len(rows) == 1 and rows[0].split(",")[1] == "200", "the episode of steps 150 to 350"
     assert not unfinished.exists()

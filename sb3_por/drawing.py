@@ -97,7 +97,13 @@ def strong(axes: Axes, x: pd.Series, y: pd.Series, look: Look, label: str) -> No
 
 def faint(axes: Axes, x: pd.Series, y: pd.Series, look: Look, label: str) -> None:
     """A thin line for what a curve is compared with."""
-    axes.plot(x, y, label=label, color=look.color, linestyle=look.style, alpha=0.5, linewidth=1)
+    # The underscore keeps it out of the legend, which has the strong line of the same look.
+    axes.plot(x, y, label=f"_{label}", color=look.color, linestyle=look.style, alpha=0.5, linewidth=1)
+
+
+def right_title(axes: Axes, text: str) -> None:
+    """What is to be seen in a panel, in small letters above its right end."""
+    axes.set_title(text, loc="right", fontsize=9, color="0.3")
 
 
 def interval(axes: Axes, row: int, value: float, low: float, high: float, look: Look) -> None:

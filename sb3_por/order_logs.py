@@ -61,6 +61,8 @@ def read_order_of(run: Path) -> pd.DataFrame:
         log.Reload()
         for metric in set(ORDER_METRICS) & {tag.removeprefix("train/") for tag in log.Tags()["scalars"]}:
             events[metric] += [(event.wall_time, event.step, event.value) for event in log.Scalars(f"train/{metric}")]
+    if not events["por_loss"]:
+        events = {metric: [] for metric in ORDER_METRICS}  # other objectives log how hard the critic pulls, too
     columns = {metric: _latest(logged) for metric, logged in events.items()}
     table = pd.DataFrame(columns, columns=ORDER_METRICS, dtype=float).rename_axis("step").reset_index()
     for key, value in run_identity(run).items():

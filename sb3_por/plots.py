@@ -17,6 +17,7 @@ from sb3_por.drawing import (
     name_rows,
     one_panel,
     panels,
+    right_title,
     steps_axis,
     strong,
     style,
@@ -30,8 +31,6 @@ LABELS = {
     "success": "success rate",
     "por_loss": "POR loss",
     "por_accuracy": "POR accuracy",
-    "encoder_grad_norm_critic": "critic",
-    "encoder_grad_norm_por": "λ POR",
 }
 #: What a classifier that knows nothing has, its name, and the limits of the axis.
 CHANCE = {"por_loss": (math.log(2), "ln 2", (0, 1.05)), "por_accuracy": (0.5, "½", (0.3, 1.02))}
@@ -174,8 +173,8 @@ def draw_order(table: pd.DataFrame) -> Figure:
                     low, high = rows["mean"] - rows["std"], rows["mean"] + rows["std"]
                     curve(axes, rows["step"], rows["mean"], low, high, by_algo[algo], algo)
                 for algo, rows in _algos(here[here["metric"] == metric.replace("por_", "por_leak_")]):
-                    look, label = by_algo[algo], f"{algo}, a frame and itself"
-                    faint(axes, rows["step"], rows["mean"], look, label)
+                    faint(axes, rows["step"], rows["mean"], by_algo[algo], algo)
+                right_title(axes, "faint: a frame and itself (k = 0)")
                 axes.axhline(chance, color="0.3", linewidth=1, linestyle=(0, (1, 2)), label="chance")
                 axes.text(1, chance, name, transform=axes.get_yaxis_transform(), va="bottom", ha="right", color="0.3")
                 axes.set_ylabel(LABELS[metric])
@@ -187,10 +186,11 @@ def draw_order(table: pd.DataFrame) -> Figure:
 
 
 def _gradients(axes: Axes, table: pd.DataFrame, by_algo: dict[str, Look]) -> None:
-    """How hard each loss pulls at the encoder: means over seeds, the critic's faint."""
+    """How hard each loss pulls at the encoder: means over seeds."""
     for metric, draw in zip(GRADIENT_METRICS, (faint, strong), strict=True):
         for algo, rows in _algos(table[table["metric"] == metric]):
-            draw(axes, rows["step"], rows["mean"], by_algo[algo], f"{algo}, {LABELS[metric]}")
+            draw(axes, rows["step"], rows["mean"], by_algo[algo], algo)
+    right_title(axes, "λ POR; faint: the critic")
     axes.set_yscale("log", nonpositive="mask")
     axes.set_ylabel("gradient norm at the encoder")
 

@@ -312,9 +312,7 @@ class Experiment(ExperimentManager):
             )
         if not self.optimize_hyperparameters:
             rng_state = read_rng_state(self._checkpoint) if self._checkpoint else None
-            self._checkpoints = CheckpointCallback(
-                self.save_freq, self.save_path, self.env_name.gym_id, stopwatch, rng_state
-            )
+            self._checkpoints = CheckpointCallback(self.save_freq, self.save_path, self.env_name.gym_id, stopwatch, rng_state)
             self.callbacks.append(self._checkpoints)
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from made_runs import log_order, random_scores, table, write_run
+from torch.utils.tensorboard import SummaryWriter
 
 from sb3_por.drawing import KNOWN, looks
 from sb3_por.errors import UserError
@@ -99,7 +100,9 @@ def test_a_figure_of_nothing_is_refused_and_left_out_of_all():
 def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
     for seed, losses in enumerate([(0.7, 0.6, 0.5), (0.7, 0.4, 0.1)]):
         log_order(write_run(tmp_path, seed=seed), losses)
-    write_run(tmp_path, algo="sac", seed=0)
+    other = write_run(tmp_path, algo="sac_curl", seed=0)
+    with SummaryWriter(other / "tb" / "SACCURL_1") as writer:
+        writer.add_scalar("train/encoder_grad_norm_critic", 1.0, 100)
     order = read_order([tmp_path])
     assert set(order["algo"]) == {"sac_por"} and order["step"].tolist() == [100, 200, 300] * 2
     assert order["por_loss"].to_numpy() == pytest.approx([0.7, 0.6, 0.5, 0.7, 0.4, 0.1])
@@ -111,7 +114,7 @@ def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
     assert loss["mean"].to_numpy() == pytest.approx([0.7, 0.5, 0.3]) and not notes
     assert {"POR loss", "POR accuracy", "PourWater-v0", "ln 2", "sac_por"} <= set(texts(one.figure).splitlines())
     gradients = {line.get_label(): line.get_ydata().tolist() for line in one.figure.axes[-1].lines}
-    assert gradients["sac_por, critic"] == [10] * 3 and gradients["sac_por, λ POR"] == pytest.approx([0.7, 0.5, 0.3])
+    assert gradients["_sac_por"] == [10] * 3 and gradients["sac_por"] == pytest.approx([0.7, 0.5, 0.3])
     drawn = [(line.get_color(), line.get_linestyle(), line.get_alpha()) for line in one.figure.axes[-1].lines]
     assert len(set(drawn)) == len(drawn)
     bare, _ = plot_order(order.drop(columns=GRADIENT_METRICS).reindex(columns=order.columns))

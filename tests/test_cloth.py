@@ -120,7 +120,7 @@ def test_performance_is_the_formula_of_the_page(env_id):
     assert env.normalized_performance() == pytest.approx(1.0)
 
     env._grid = folded + np.array([0.03, 0.0, 0.0])
-    weight = {"FoldCloth-v0": 1.2, "DropFoldCloth-v0": 3.0}[env_id]
+    weight = {"FoldCloth-v0": 1.2, "DropFoldCloth-v0": 7.0}[env_id]
     assert env.performance() == pytest.approx(-weight * 0.03)
     assert env.monotone() == pytest.approx(0.0)
 

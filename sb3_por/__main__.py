@@ -153,20 +153,19 @@ def _diagnose_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _diagnose(args: argparse.Namespace) -> None:
-    import softbody_envs  # noqa: F401  (registers its ids)
     from sb3_por.diagnostics import check_order, diagnose, diagnose_runs
     from sb3_por.files import check_output
 
     if args.csv:
         check_output(args.csv, (".csv",))
+    if bool(args.paths) == bool(args.model and args.env) or (args.csv and not args.paths):
+        raise UserError("give --model and --env, or folders of runs and perhaps --csv (diagnose --help lists the arguments)")
     if args.paths:
         table = diagnose_runs(args.paths, args.n_episodes, args.seed)
         if args.csv:
             table.to_csv(args.csv, index=False, float_format="%.5g")
         print(table.to_json(orient="records", indent=2) if args.json else table.round(3).to_string(index=False))
         return
-    if args.model is None or args.env is None:
-        raise UserError("say which model: --model and --env, or folders of runs (diagnose --help lists the arguments)")
     model, vec_normalize = _load(args)
     check_order(model)
     diagnosis = diagnose(model, args.env, args.n_episodes, args.seed, vec_normalize)

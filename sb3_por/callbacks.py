@@ -36,6 +36,7 @@ class Stopwatch:
         self._started = time.monotonic()
 
     def seconds(self) -> float:
+        """Seconds so far."""
         return self._before + time.monotonic() - self._started
 
 

@@ -117,4 +117,6 @@ def test_runs_become_a_table_of_what_their_classifiers_learned(model_file, tmp_p
     assert "mine" in capsys.readouterr().out and (tmp_path / "table.csv").read_text().startswith("env,algo,seed,step,loss,")
     with pytest.raises(UserError, match="none of these runs has ended with a model that learns an order"):
         diagnose_runs([other])
-    assert main(["diagnose", "--env", "FallingBall-v0"]) == 2 and "say which model" in capsys.readouterr().err
+    model = ["--model", str(model_file), "--env", "FallingBall-v0"]
+    for arguments in (model[2:], [*model, str(tmp_path)], [*model, "--csv", str(tmp_path / "x.csv")]):
+        assert main(["diagnose", *arguments]) == 2 and "give --model and --env, or folders" in capsys.readouterr().err

@@ -209,6 +209,20 @@ def test_hyperparameter_files_hold_numbers_where_they_mean_numbers(file):
             assert not (isinstance(value, str) and value[:1].isdigit()), f"{name}: {key} is the string {value!r}"
 
 
+@pytest.mark.parametrize("folder", [".", "paper"])
+def test_rivals_differ_by_what_belongs_to_their_methods_alone(folder):
+    files = (ROOT / "zoo_hyperparams" / folder / f"{algo}.yml" for algo in ALGORITHMS)
+    own = {"por_coef", "curl_coef", "spr_coef", "pairing", "n_augmentations", "n_target_augmentations"}
+    first, *others = [
+        {
+            env: {key: value for key, value in settings.items() if key not in own}
+            for env, settings in yaml.safe_load(text).items()
+        }
+        for text in (file.read_text() for file in files)
+    ]
+    assert len(others) == 4 and all(other == first for other in others)
+
+
 @pytest.mark.parametrize("algo", sorted(ALGORITHMS))
 def test_every_algorithm_has_settings(algo):
     assert hyperparameter_file(algo, "PourWater-v0") == ROOT / "zoo_hyperparams" / f"{algo}.yml"

@@ -50,25 +50,25 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print every episode as JSON")
 
 
-def _load(args: argparse.Namespace) -> tuple[Any, str | None]:
-    """The model that the arguments name and the statistics that normalise its observations."""
+def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
+    """The model that the arguments name and the environment that it was trained in."""
     import softbody_envs  # noqa: F401  (registers its ids)
 
     check_known("environment", args.env, gym.registry)
     from sb3_por.reference import REFERENCES
 
     if args.model in REFERENCES:
-        return REFERENCES[args.model](args.env), None
-    from sb3_por.loading import load_model, vec_normalize_file
+        return REFERENCES[args.model](args.env), {}
+    from sb3_por.loading import load_model, trained_in
 
-    return load_model(args.model, args.algo), vec_normalize_file(args.model, args.env)
+    return load_model(args.model, args.algo), trained_in(args.model, args.env)
 
 
 def _evaluate(args: argparse.Namespace) -> None:
     from sb3_por.evaluation import evaluate
 
-    model, vec_normalize = _load(args)
-    evaluation = evaluate(model, args.env, args.n_episodes, args.seed, vec_normalize=vec_normalize)
+    model, environment = _load(args)
+    evaluation = evaluate(model, args.env, args.n_episodes, args.seed, **environment)
     if args.json:
         print(json.dumps({"model": args.model, "env": args.env, "seed": args.seed, **evaluation.as_dict()}, indent=2))
     else:
@@ -87,8 +87,8 @@ def _enjoy(args: argparse.Namespace) -> None:
     from sb3_por.film import check_film, film
 
     check_film(args.output)
-    model, vec_normalize = _load(args)
-    print(film(model, args.env, args.output, args.n_episodes, args.seed, args.size, vec_normalize))
+    model, environment = _load(args)
+    print(film(model, args.env, args.output, args.n_episodes, args.seed, args.size, **environment))
     print(args.output)
 
 
@@ -166,9 +166,9 @@ def _diagnose(args: argparse.Namespace) -> None:
             table.to_csv(args.csv, index=False, float_format="%.5g")
         print(table.to_json(orient="records", indent=2) if args.json else table.round(3).to_string(index=False))
         return
-    model, vec_normalize = _load(args)
+    model, environment = _load(args)
     check_order(model)
-    diagnosis = diagnose(model, args.env, args.n_episodes, args.seed, vec_normalize)
+    diagnosis = diagnose(model, args.env, args.n_episodes, args.seed, **environment)
     if args.json:
         print(json.dumps({"model": args.model, "env": args.env, "seed": args.seed, **diagnosis.as_dict()}, indent=2))
     else:
@@ -185,8 +185,8 @@ def _saliency_arguments(parser: argparse.ArgumentParser) -> None:
 def _saliency(args: argparse.Namespace) -> None:
     from sb3_por.saliency import draw_saliency
 
-    model, vec_normalize = _load(args)
-    step = draw_saliency(model, args.env, args.output, args.step, args.seed, vec_normalize)
+    model, environment = _load(args)
+    step = draw_saliency(model, args.env, args.output, args.step, args.seed, **environment)
     print(f"step {step}: {args.output}")
 
 

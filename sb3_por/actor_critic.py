@@ -4,7 +4,6 @@ import io
 import pathlib
 import warnings
 from abc import ABC, abstractmethod
-from collections import defaultdict
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -15,6 +14,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.acceleration import check_precision, compile_networks
+from sb3_por.means import Means
 from sb3_por.memory import keep_freed_memory
 from sb3_por.objectives.base import Objective
 from sb3_por.overlap import OverlappedEnv
@@ -109,7 +109,7 @@ class VisualActorCritic(Algorithm):
         self.overlap = overlap
         self._defer, self._updates_due = False, 0
         self.rng_state: dict[str, Any] | None = None
-        self._metrics: dict[str, list[th.Tensor]] = defaultdict(list)
+        self._metrics = Means()
         kwargs["target_update_interval"] = target_update_interval
         super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, *args, **kwargs)
 
@@ -150,7 +150,7 @@ class VisualActorCritic(Algorithm):
             th.backends.cudnn.allow_tf32 = True
         if self.compile_mode is not None:
             compile_networks(self.policy, self.compile_mode)
-        self._metrics = defaultdict(list)
+        self._metrics = Means()
         self._preparation = Preparation(self.policy, self.augmentation_pad, self.n_augmentations, self.n_target_augmentations)
 
     def _check_buffer(self) -> None:
@@ -239,8 +239,8 @@ class VisualActorCritic(Algorithm):
         if self._n_updates % self.target_update_interval == 0:
             self._update_targets()
 
-        self._metrics["ent_coef"].append(ent_coef.reshape(()))
-        self._metrics["critic_loss"].append(critic_loss.detach())
+        self._metrics.add("ent_coef", ent_coef)
+        self._metrics.add("critic_loss", critic_loss)
 
     def _autocast(self) -> th.autocast:
         """Mixed precision for the forward passes of an update, if asked for."""
@@ -286,7 +286,7 @@ class VisualActorCritic(Algorithm):
 
     def _log_objective(self, metrics: dict[str, th.Tensor]) -> None:
         for name, value in metrics.items():
-            self._metrics[f"{self.policy.objective.name}_{name}"].append(value)
+            self._metrics.add(f"{self.policy.objective.name}_{name}", value)
 
     def _actor_input(self, views: Views, name: str) -> th.Tensor:
         """Trunk features for the actor: the critic's, detached, unless the actor has a trunk of its own."""
@@ -308,14 +308,14 @@ class VisualActorCritic(Algorithm):
         # Named inputs: the critic's weights get no gradient, and none is computed for them
         actor_loss.backward(inputs=[p for group in self.actor.optimizer.param_groups for p in group["params"]])
         self.actor.optimizer.step()
-        self._metrics["actor_loss"].append(actor_loss.detach())
+        self._metrics.add("actor_loss", actor_loss)
 
         if self.ent_coef_optimizer is not None:
             ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
             self.ent_coef_optimizer.zero_grad()
             ent_coef_loss.backward()
             self.ent_coef_optimizer.step()
-            self._metrics["ent_coef_loss"].append(ent_coef_loss.detach())
+            self._metrics.add("ent_coef_loss", ent_coef_loss)
 
     @property
     def momentum_tau(self) -> float:
@@ -339,7 +339,7 @@ class VisualActorCritic(Algorithm):
         if objective is None or self._n_updates % self.diagnostics_interval != 0:
             return
         for name, norm in self._encoder_grad_norms(critic_loss, objective_loss).items():
-            self._metrics[f"encoder_grad_norm_{name}"].append(norm)
+            self._metrics.add(f"encoder_grad_norm_{name}", norm)
         with th.no_grad():
             self._log_objective(objective.control(self._preparation.control_views(replay_data)))
 
@@ -355,9 +355,8 @@ class VisualActorCritic(Algorithm):
 
     def _record_metrics(self) -> None:
         """Hand the means since the last time to the logger, which averages them until it writes: the one place that waits."""
-        for name, values in self._metrics.items():
-            self.logger.record_mean(f"train/{name}", th.stack(values).mean().item())
-        self._metrics.clear()
+        for name, mean in self._metrics.take().items():
+            self.logger.record_mean(f"train/{name}", mean)
 
     def dump_logs(self) -> None:
         self._record_metrics()

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.errors import UserError
 from sb3_por.evaluation import evaluation_episodes, make_evaluation_env
-from sb3_por.loading import load_model, vec_normalize_file
+from sb3_por.loading import load_model, trained_in
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.replay import SequenceReplayBuffer
 from sb3_por.runs import find_runs, is_finished
@@ -85,7 +85,14 @@ def check_order(model: Any) -> PartialOrder:
     return objective
 
 
-def diagnose(model: Any, env_id: str, n_episodes: int = 5, seed: int = 0, vec_normalize: str | None = None) -> Diagnosis:
+def diagnose(
+    model: Any,
+    env_id: str,
+    n_episodes: int = 5,
+    seed: int = 0,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_normalize: str | None = None,
+) -> Diagnosis:
     """
     Play held-out episodes with a model and at random, and measure its partial-order objective on their frames.
 
@@ -93,13 +100,14 @@ def diagnose(model: Any, env_id: str, n_episodes: int = 5, seed: int = 0, vec_no
     :param env_id: a Gymnasium id; for the correlation one that reports ``info["monotone"]``
     :param n_episodes: of each policy
     :param seed: of the first episode, the random policy, and the pairs; the global generators are set to it
+    :param env_kwargs: for the environment's constructor
     :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
     :raises UserError: if the model learns no order, or was not trained on this environment
     """
     objective = check_order(model)
     if n_episodes < 1:
         raise UserError(f"a diagnosis needs at least 1 episode, got {n_episodes}")
-    env = make_evaluation_env(model, env_id, vec_normalize=vec_normalize)
+    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize)
     set_random_seed(seed)
     env.action_space.seed(seed)
     model.policy.set_training_mode(False)
@@ -152,7 +160,7 @@ def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int 
         model: Any = load_model(file)
         if not isinstance(getattr(model.policy, "objective", None), PartialOrder):
             continue
-        measured = diagnose(model, identity["env"], n_episodes, seed, vec_normalize_file(file, identity["env"])).as_dict()
+        measured = diagnose(model, identity["env"], n_episodes, seed, **trained_in(file, identity["env"])).as_dict()
         del measured["correlations"]
         rows.append({**identity, "step": model.num_timesteps, **measured})
     if not rows:

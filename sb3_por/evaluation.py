@@ -144,6 +144,14 @@ def evaluation_kwargs(env_id: str) -> dict[str, Any]:
     return {"split": "eval"} if env_id in ENV_IDS else {}
 
 
+def whole_episodes(env_kwargs: dict[str, Any]) -> dict[str, Any]:
+    """
+    A training environment's arguments as evaluation takes them. Training episodes may be cut short (so that a picker that
+    has gone astray starts again); what is scored is whole.
+    """
+    return {name: value for name, value in env_kwargs.items() if name != "max_episode_steps"}
+
+
 def has_diverged(model: Model) -> bool:
     """Whether a parameter of the model's networks is NaN or infinite."""
     policy = getattr(model, "policy", None)

@@ -29,6 +29,7 @@ def film(
     n_episodes: int = 1,
     seed: int = EVAL_SEED,
     size: int = 480,
+    env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
 ) -> Evaluation:
     """
@@ -40,6 +41,7 @@ def film(
     :param n_episodes: number of episodes, one after the other
     :param seed: seed of the first episode
     :param size: height and width in pixels, for environments that let it be chosen
+    :param env_kwargs: for the environment's constructor
     :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
     :return: how the model did
     :raises UserError: if the environment does not fit the model or draws no images
@@ -47,7 +49,8 @@ def film(
     path = check_film(path)
     if n_episodes < 1:
         raise UserError(f"a film needs at least 1 episode, got {n_episodes}")
-    kwargs: dict[str, Any] = {"render_mode": "rgb_array"} | ({"render_size": size} if env_id in ENV_IDS else {})
+    drawn: dict[str, Any] = {"render_mode": "rgb_array"} | ({"render_size": size} if env_id in ENV_IDS else {})
+    kwargs = (env_kwargs or {}) | drawn
     env = make_evaluation_env(model, env_id, kwargs, vec_normalize, lambda inner: RenderCollection(inner, reset_clean=False))
     try:
         fps = env.get_attr("metadata")[0].get("render_fps", 30)

@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_por import ALGORITHMS
 from sb3_por.errors import UserError, check_known, one_line
+from sb3_por.evaluation import whole_episodes
 from sb3_por.runs import read_settings
 
 #: name -> class of every algorithm whose models can be loaded; a DDPG model is a TD3 model with other settings
@@ -64,10 +65,21 @@ def model_file(path: str | Path) -> Path:
     return path
 
 
-def vec_normalize_file(path: str | Path, env_id: str) -> str | None:
-    """The ``VecNormalize`` statistics that the zoo saved beside a model, if it was trained with them."""
-    statistics = model_file(path).parent / env_id / "vecnormalize.pkl"
-    return str(statistics) if statistics.is_file() else None
+def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
+    """
+    The environment that a run's model was trained in, as far as its folder says.
+
+    :param path: as :func:`load_model` takes it
+    :param env_id: the environment
+    :return: the arguments ``env_kwargs`` and ``vec_normalize`` of :func:`sb3_por.evaluation.evaluate` and its likes
+    """
+    folder = model_file(path).parent / env_id
+    env_kwargs = read_settings(folder / "config.yml").get("env_kwargs")
+    statistics = folder / "vecnormalize.pkl"
+    return {
+        "env_kwargs": whole_episodes(env_kwargs) if isinstance(env_kwargs, dict) else {},
+        "vec_normalize": str(statistics) if statistics.is_file() else None,
+    }
 
 
 def read_data(path: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from sb3_por.files import atomic_write, check_writable
 from sb3_por.film import film
 from sb3_por.grids import in_order
 from sb3_por.inventory import RunFacts, orphaned_logs, take_inventory
-from sb3_por.loading import LOADABLE, load_model, vec_normalize_file
+from sb3_por.loading import LOADABLE, load_model, trained_in
 from sb3_por.order_logs import find_order
 from sb3_por.plots import LABELS
 from sb3_por.runs import EVALUATIONS
@@ -229,13 +229,13 @@ def _show_models(best: Iterator[tuple[str, str, RunFacts, float]], notes: list[s
             path = Path(folder) / "film.gif"
             try:
                 model = load_model(run.folder, algo if algo in LOADABLE else None)
-                statistics = vec_normalize_file(run.folder, env)
-                film(model, env, path, size=FILM_SIZE, vec_normalize=statistics)
+                environment = trained_in(run.folder, env)
+                film(model, env, path, size=FILM_SIZE, **environment)
                 title = f"{algo}, seed {run.seed}: best of its evaluations {_printed(score)}"
                 shown.setdefault(env, []).append(_picture(title, path))
                 if _learns_order(model):
                     path = Path(folder) / "saliency.png"
-                    frame = draw_saliency(model, env, path, vec_normalize=statistics)
+                    frame = draw_saliency(model, env, path, **environment)
                     title = f"{algo}, seed {run.seed}: what its classifier looks at in frame {frame}"
                     shown[env].append(_picture(title, path))
             except UserError as error:

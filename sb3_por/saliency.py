@@ -63,7 +63,13 @@ def overlay(frame: np.ndarray, heat: np.ndarray, size: int = SIZE) -> np.ndarray
 
 
 def draw_saliency(
-    model: Any, env_id: str, path: str | Path, step: int | None = None, seed: int = 0, vec_normalize: str | None = None
+    model: Any,
+    env_id: str,
+    path: str | Path,
+    step: int | None = None,
+    seed: int = 0,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_normalize: str | None = None,
 ) -> int:
     """
     Play the first held-out episode, and draw what the classifier looks at in one of its frames.
@@ -73,6 +79,7 @@ def draw_saliency(
     :param path: ``.png`` or ``.jpg``
     :param step: number of the later frame; by default where ``info["monotone"]`` rises most
     :param seed: of the episode
+    :param env_kwargs: for the environment's constructor
     :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
     :return: the step that was drawn
     :raises UserError: if the model learns no order from images, or there is no such step
@@ -81,7 +88,7 @@ def draw_saliency(
     path = check_output(path, FORMATS)
     if not isinstance(model.observation_space, spaces.Box) or len(model.observation_space.shape) != 3:
         raise UserError(f"a saliency map needs a model that sees images alone, not {model.observation_space}")
-    env = make_evaluation_env(model, env_id, vec_normalize=vec_normalize)
+    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize)
     try:
         env.env_method("play", evaluation_episodes(env_id, 1, seed))
         observation: Any = env.reset()

@@ -42,7 +42,7 @@ from sb3_por.checkpoints import (
     restore_monitors,
 )
 from sb3_por.errors import UserError, check_known, exit_code, one_line
-from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged
+from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
 from sb3_por.files import atomic_write, check_writable, remove_unfinished
 from sb3_por.loading import model_file, read_data
 from sb3_por.runs import current_commit, current_machine, read_settings, run_arguments, write_settings
@@ -230,9 +230,7 @@ class Experiment(ExperimentManager):
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         held_out = evaluation_kwargs(self.env_name.gym_id)
-        # Training episodes may be cut short (so that a picker that has gone astray starts again); what is scored is whole.
-        whole = {name: value for name, value in self.env_kwargs.items() if name != "max_episode_steps"}
-        self.eval_env_kwargs = {**whole, **held_out, **(self._eval_env_kwargs_args or {})}
+        self.eval_env_kwargs = {**whole_episodes(self.env_kwargs), **held_out, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved
 
     def create_log_folder(self) -> None:

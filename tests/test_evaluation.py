@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from sb3_por.errors import UserError
 from sb3_por.evaluation import Episode, Evaluation, FixedEpisodes, evaluate, evaluation_episodes, run_episodes
 from sb3_por.film import film, write_film
-from sb3_por.loading import load_model, vec_normalize_file
+from sb3_por.loading import load_model, trained_in
 from sb3_por.reference import ExpertModel, RandomModel
 
 EPISODE_STEPS = 7
@@ -106,11 +106,23 @@ def test_stacked_frames_and_normalised_observations_are_restored(tmp_path):
     (tmp_path / "Pendulum-v1").mkdir()
     env.venv.save(str(tmp_path / "Pendulum-v1" / "vecnormalize.pkl"))
     model.save(tmp_path / "best_model.zip")
-    statistics = vec_normalize_file(tmp_path, "Pendulum-v1")
+    environment = trained_in(tmp_path, "Pendulum-v1")
     plain = evaluate(model, "Pendulum-v1", n_episodes=1)
-    normalised = evaluate(model, "Pendulum-v1", n_episodes=1, vec_normalize=statistics)
+    normalised = evaluate(model, "Pendulum-v1", n_episodes=1, **environment)
     assert plain.returns != normalised.returns
-    assert vec_normalize_file(tmp_path, "PourWater-v0") is None
+    assert trained_in(tmp_path, "PourWater-v0") == {"env_kwargs": {}, "vec_normalize": None}
+
+
+def test_a_run_is_evaluated_in_the_environment_that_it_was_trained_in_but_on_whole_episodes(tmp_path):
+    model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, seed=0)
+    model.save(tmp_path / "best_model.zip")
+    (tmp_path / "Pendulum-v1").mkdir()
+    (tmp_path / "Pendulum-v1" / "config.yml").write_text("env_kwargs: {g: 1.0, max_episode_steps: 7}\n")
+    environment = trained_in(tmp_path, "Pendulum-v1")
+    assert environment == {"env_kwargs": {"g": 1.0}, "vec_normalize": None}
+    light = evaluate(model, "Pendulum-v1", n_episodes=1, **environment)
+    assert light.lengths == [200]
+    assert light.returns != evaluate(model, "Pendulum-v1", n_episodes=1).returns
 
 
 def test_expert_is_the_ceiling_and_random_the_floor():

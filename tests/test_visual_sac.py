@@ -172,7 +172,7 @@ def test_logs_objective_control_and_gradient_norms():
 
 def test_what_is_logged_is_the_mean_of_all_updates_since_the_last_time():
     model, values = make_model(SACPOR), iter([1.0, 3.0, 8.0])
-    model._update = lambda batch_size: model._metrics["value"].append(th.tensor(next(values)))
+    model._update = lambda batch_size: model._metrics.add("value", th.tensor(next(values)))
     model.train(1, 8)
     model.train(1, 8)
     assert model.logger.name_to_value["train/value"] == 2.0

@@ -3,7 +3,10 @@
 import inspect
 import json
 import pickle
+import warnings
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,14 @@ LOADABLE: dict[str, type[BaseAlgorithm]] = {
     **{name.lower(): getattr(sb3_contrib, name) for name in ("CrossQ", "TQC", "TRPO")},
     **ALGORITHMS,
 }
+
+
+@contextmanager
+def quiet_n_steps() -> Iterator[None]:
+    """SB3 takes the buffer of n-step returns that it chose itself, in a loaded model, for one of the user's, and warns."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="`n_steps=.*NStepReplayBuffer")
+        yield
 
 
 def load_model(path: str | Path, algo: str | None = None, device: str = "auto") -> BaseAlgorithm:
@@ -43,7 +54,8 @@ def load_model(path: str | Path, algo: str | None = None, device: str = "auto") 
     problem: Exception | None = None
     for name in candidates:
         try:
-            return LOADABLE[name].load(path, device=device, **buffer)
+            with quiet_n_steps():
+                return LOADABLE[name].load(path, device=device, **buffer)
         # SB3 loads strictly: the wrong class fails on the names of the networks' parameters.
         except (AssertionError, AttributeError, KeyError, RuntimeError, TypeError, ValueError, pickle.PickleError) as error:
             problem = problem or error

@@ -44,7 +44,7 @@ from sb3_por.checkpoints import (
 from sb3_por.errors import UserError, check_known, exit_code, one_line
 from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
 from sb3_por.files import atomic_write, check_writable, remove_unfinished
-from sb3_por.loading import model_file, read_data
+from sb3_por.loading import model_file, quiet_n_steps, read_data
 from sb3_por.runs import current_commit, current_machine, read_settings, run_arguments, write_settings
 from sb3_por.search_spaces import sampler
 
@@ -315,7 +315,8 @@ class Experiment(ExperimentManager):
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         """From a checkpoint, the replay buffer, too; and scenes that were not drawn at the beginning of the run."""
-        model = super()._load_pretrained_agent(hyperparams, env)
+        with quiet_n_steps():
+            model = super()._load_pretrained_agent(hyperparams, env)
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
             env.seed((self.seed + model.num_timesteps) % 2**32)

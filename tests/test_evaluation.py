@@ -172,6 +172,12 @@ def test_algorithm_is_found_from_the_file(pendulum_zip, tmp_path, pendulum_model
         assert type(load_model(tmp_path / "model.zip")) is cls
 
 
+def test_a_model_with_n_step_returns_is_loaded_without_a_warning(tmp_path, recwarn):
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, n_steps=3).save(tmp_path / "model.zip")
+    assert load_model(tmp_path / "model.zip").n_steps == 3
+    assert not [warning for warning in recwarn if "n_steps" in str(warning.message)]
+
+
 def test_files_that_are_no_models_are_refused(pendulum_zip, tmp_path):
     whole = pendulum_zip.read_bytes()
     (tmp_path / "text.zip").write_text("no zip")

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch as th
 from torch import nn
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
@@ -28,5 +29,10 @@ def compile_networks(policy: Any, mode: str) -> None:
         modules += [critic.features_extractor, *critic.q_networks]
     if policy.objective is not None:
         modules += policy.objective.children()
+    from torch._functorch import config as functorch_config
+
+    # Gradient norms and objectives with optimizers of their own go twice through one graph
+    functorch_config.donated_buffer = False
     for module in modules:
-        module.compile(mode=mode)
+        # Not module.compile(), which passes over the containers of PyTorch
+        module.forward = th.compile(module.forward, mode=mode)  # type: ignore[method-assign]

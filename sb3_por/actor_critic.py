@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
-from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.utils import polyak_update, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.acceleration import check_precision, compile_networks
@@ -35,8 +35,8 @@ class VisualActorCritic(Algorithm):
     arguments below; ``VisualSAC`` documents all of them.
 
     One update: encode each frame once per encoder; critic loss + coefficient * objective loss, one backward, one
-    optimizer step over encoder, critic and objective; actor and temperature on the detached trunk features; moving
-    averages last.
+    optimizer step over encoder, critic and objective (two, for objectives with an optimizer of their own); actor and
+    temperature on the detached trunk features; moving averages last.
 
     :param encoder_tau: tau of the momentum encoder; ``encoder_tau_ratio`` times that of the Q networks (``tau``) by default
     :param actor_update_interval: Update actor and temperature every that many updates
@@ -51,13 +51,15 @@ class VisualActorCritic(Algorithm):
         (``SubprocVecEnv``). Updates that are due after a rollout are made in the first step of the next one, always
         between sending the actions and waiting for the results, so that runs stay reproducible
     :param precision: Of the updates: ``"float32"``, ``"tf32"`` (matrix products and convolutions of a GPU that has it;
-        a setting of the whole process), or ``"bfloat16"`` (automatic mixed precision)
+        a setting of the whole process), or ``"bfloat16"`` (trunks only: Q values and probabilities need more)
     :param compile_mode: Compile the networks with this mode of ``torch.compile``, for example ``"default"`` or
         ``"reduce-overhead"`` (CUDA graphs); None for none
     """
 
     #: How much faster the momentum encoder follows than the Q networks, unless it is told.
     encoder_tau_ratio: ClassVar[float] = 1.0
+    #: Learning rate of an objective that has an optimizer of its own, in units of ``learning_rate``.
+    aux_lr_ratio: float = 1.0
 
     # What SAC and TQC have in common
     policy: Any
@@ -124,7 +126,7 @@ class VisualActorCritic(Algorithm):
         """
         :return: Weight lambda of the objective's loss
         """
-        return 0.0
+        return 1.0
 
     def _setup_model(self) -> None:
         objective_class, objective_kwargs = self._objective()
@@ -138,7 +140,9 @@ class VisualActorCritic(Algorithm):
             if issubclass(self.replay_buffer_class, SequenceReplayBuffer):
                 # SB3 knows its own buffers only
                 warnings.filterwarnings("ignore", message="`n_steps=")
+            rng_state = self.rng_state  # a loaded model's; the seed that SB3 sets here is that of its first start
             super()._setup_model()
+            self.rng_state = rng_state
         if isinstance(self.replay_buffer, SequenceReplayBuffer):
             # Set, it would make SB3 end the episode that a second learn() cuts off
             self.optimize_memory_usage = False
@@ -151,7 +155,13 @@ class VisualActorCritic(Algorithm):
         if self.compile_mode is not None:
             compile_networks(self.policy, self.compile_mode)
         self._metrics = Means()
-        self._preparation = Preparation(self.policy, self.augmentation_pad, self.n_augmentations, self.n_target_augmentations)
+        self._preparation = Preparation(
+            self.policy,
+            self.augmentation_pad,
+            self.n_augmentations,
+            self.n_target_augmentations,
+            bfloat16=self.precision == "bfloat16",
+        )
 
     def _check_buffer(self) -> None:
         """The objective needs frames that only some buffers can sample."""
@@ -160,7 +170,8 @@ class VisualActorCritic(Algorithm):
         if objective is None or isinstance(buffer, SequenceReplayBuffer):
             return
         next_is_future = not (isinstance(buffer, NStepReplayBuffer) and buffer.n_steps > 1)
-        if objective.window > 0 or (objective.future or (1, 1)) != (1, 1) or not next_is_future:
+        has_future = objective.future is None or (objective.future == (1, 1) and next_is_future)
+        if objective.window > 0 or not has_future:
             raise ValueError(
                 f"{type(buffer).__name__} cannot sample the later frames that {type(self).__name__} needs with these "
                 "settings: use the default replay_buffer_class, SequenceReplayBuffer."
@@ -206,6 +217,9 @@ class VisualActorCritic(Algorithm):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
+        if self.policy.objective_optimizer is not None:
+            aux_learning_rate = self.aux_lr_ratio * self.lr_schedule(self._current_progress_remaining)
+            update_learning_rate(self.policy.objective_optimizer, aux_learning_rate)
 
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -219,19 +233,18 @@ class VisualActorCritic(Algorithm):
         """
         :param batch_size: Transitions of this update
         """
+        if self.compile_mode is not None:
+            # CUDA graphs keep what they return until the next update: trunk features are used again
+            th.compiler.cudagraph_mark_step_begin()
         replay_data = self._sample(batch_size)
         if self.use_sde:
             # log_std may have changed since the last update
             self.actor.reset_noise()
         views = self._preparation.views(replay_data)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
-        with self._autocast():
-            critic_loss, objective_loss = self._encoder_losses(replay_data, views, ent_coef)
-
+        critic_loss, objective_loss = self._encoder_losses(replay_data, views, ent_coef)
         self._diagnose(replay_data, critic_loss, objective_loss)
-        self.critic.optimizer.zero_grad()
-        (critic_loss + objective_loss).backward()
-        self.critic.optimizer.step()
+        self._update_encoder(critic_loss, objective_loss)
 
         if self._n_updates % self.actor_update_interval == 0:
             self._update_actor(views, ent_coef)
@@ -242,9 +255,22 @@ class VisualActorCritic(Algorithm):
         self._metrics.add("ent_coef", ent_coef)
         self._metrics.add("critic_loss", critic_loss)
 
-    def _autocast(self) -> th.autocast:
-        """Mixed precision for the forward passes of an update, if asked for."""
-        return th.autocast(self.device.type, th.bfloat16, enabled=self.precision == "bfloat16")
+    def _update_encoder(self, critic_loss: th.Tensor, objective_loss: th.Tensor) -> None:
+        """One step of critic, encoder and objective, or one for each loss."""
+        own_optimizer = self.policy.objective_optimizer
+        self.critic.optimizer.zero_grad()
+        if own_optimizer is None:
+            (critic_loss + objective_loss).backward()
+            self.critic.optimizer.step()
+            return
+        parameters = [parameter for group in own_optimizer.param_groups for parameter in group["params"]]
+        # Before the critic's step changes what this gradient was computed with
+        gradients = th.autograd.grad(objective_loss, parameters, retain_graph=True, allow_unused=True)
+        critic_loss.backward()
+        self.critic.optimizer.step()
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        own_optimizer.step()
 
     def _encoder_losses(self, replay_data: Any, views: Views, ent_coef: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """L_RL and lambda * L_objective: the two losses that train the encoder."""
@@ -290,7 +316,7 @@ class VisualActorCritic(Algorithm):
 
     def _actor_input(self, views: Views, name: str) -> th.Tensor:
         """Trunk features for the actor: the critic's, detached, unless the actor has a trunk of its own."""
-        return views.trunk(name) if self.actor.detach_trunk else self.actor.trunk(views.frames[name])
+        return views.trunk(name) if self.actor.detach_trunk else views.trunk_of(self.actor, views.frames[name])
 
     def _value_of(self, views: Views, name: str, ent_coef: th.Tensor) -> th.Tensor:
         """Value of one augmentation of the next observations under the target critic."""
@@ -299,11 +325,10 @@ class VisualActorCritic(Algorithm):
 
     def _update_actor(self, views: Views, ent_coef: th.Tensor) -> None:
         """One step of actor and temperature. No gradient reaches critic and encoder."""
-        with self._autocast():
-            actions, log_prob = self.actor.action_log_prob_of(self._actor_input(views, "obs"))
-            with th.no_grad():
-                features = self.critic.projection(views.trunk("obs"))
-            actor_loss = (ent_coef * log_prob - self._actor_values(features, actions)).mean()
+        actions, log_prob = self.actor.action_log_prob_of(self._actor_input(views, "obs"))
+        with th.no_grad():
+            features = self.critic.projection(views.trunk("obs"))
+        actor_loss = (ent_coef * log_prob - self._actor_values(features, actions)).mean()
         self.actor.optimizer.zero_grad()
         # Named inputs: the critic's weights get no gradient, and none is computed for them
         actor_loss.backward(inputs=[p for group in self.actor.optimizer.param_groups for p in group["params"]])
@@ -416,6 +441,21 @@ class VisualActorCritic(Algorithm):
         self.rng_state = None
         return result
 
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        :param seed: Seed of the random generators; what a loaded model brought of theirs is forgotten
+        """
+        super().set_random_seed(seed)
+        self.rng_state = None
+
+    @classmethod
+    def load(cls, *args: Any, **kwargs: Any) -> Any:
+        """See SB3. A model that is given a ``seed`` does not go on with the random numbers of the saved one."""
+        model = super().load(*args, **kwargs)
+        if "seed" in kwargs:
+            model.rng_state = None
+        return model
+
     def save(
         self,
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -436,6 +476,11 @@ class VisualActorCritic(Algorithm):
             super().save(path, exclude, include)
         finally:
             self.rng_state = loaded
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        own = [] if self.policy.objective_optimizer is None else ["policy.objective_optimizer"]
+        return [*state_dicts, *own], tensors
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_metrics", "_preparation"]

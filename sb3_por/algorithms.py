@@ -98,46 +98,40 @@ class SACDrQ(VisualSAC):
 
 class SACCURL(VisualSAC):
     """
-    CURL: SAC from pixels with a contrastive objective. Arguments: those of ``VisualSAC`` and
+    CURL: SAC from pixels with a contrastive objective, which has an optimizer of its own. Arguments: those of ``VisualSAC``
+    and
 
-    :param curl_coef: Weight of the contrastive loss
+    :param aux_lr_ratio: Learning rate of the objective's optimizer, in units of ``learning_rate``
     """
 
     encoder_tau_ratio: ClassVar[float] = MOMENTUM_TAU_RATIO
 
-    def __init__(self, *args: Any, curl_coef: float = 1.0, **kwargs: Any):
-        self.curl_coef = curl_coef
+    def __init__(self, *args: Any, aux_lr_ratio: float = 1.0, **kwargs: Any):
+        self.aux_lr_ratio = aux_lr_ratio
         super().__init__(*args, **kwargs)
 
     def _objective(self) -> tuple[type[Objective], dict[str, Any]]:
         return Contrastive, {}
 
-    @property
-    def objective_coef(self) -> float:
-        return self.curl_coef
-
 
 class SACSPR(VisualSAC):
     """
-    SPR: SAC from pixels with a self-predictive objective. Arguments: those of ``VisualSAC`` and
+    SPR: SAC from pixels with a self-predictive objective, which has an optimizer of its own. Arguments: those of
+    ``VisualSAC`` and
 
-    :param spr_coef: Weight of the loss, which is summed over the steps
+    :param aux_lr_ratio: Learning rate of the objective's optimizer, in units of ``learning_rate``
     :param horizon: Number K of steps to predict
     """
 
     encoder_tau_ratio: ClassVar[float] = MOMENTUM_TAU_RATIO
 
-    def __init__(self, *args: Any, spr_coef: float = 1.0, horizon: int = 5, **kwargs: Any):
-        self.spr_coef = spr_coef
+    def __init__(self, *args: Any, aux_lr_ratio: float = 1.0, horizon: int = 5, **kwargs: Any):
+        self.aux_lr_ratio = aux_lr_ratio
         self.horizon = horizon
         super().__init__(*args, **kwargs)
 
     def _objective(self) -> tuple[type[Objective], dict[str, Any]]:
         return SelfPredictive, dict(horizon=self.horizon)
-
-    @property
-    def objective_coef(self) -> float:
-        return self.spr_coef
 
 
 ALGORITHMS: dict[str, type[VisualActorCritic]] = {

@@ -134,6 +134,11 @@ class VisualCritic(EncoderOwner, ContinuousCritic):
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         return self.q_values(self.encode(obs), actions)
 
+    def q1_forward(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        with th.no_grad():
+            features = self.encode(obs)
+        return self.q_networks[0](th.cat([features, actions], dim=1))
+
     def q_values(self, features: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
         :param features: Encoded observations, shape ``(batch, features_dim)``
@@ -231,12 +236,20 @@ class VisualPolicy(Policy):
                 self.critic.features_extractor.features_dim, action_dim, **self.objective_kwargs
             )
 
-        # One optimizer for one summed loss: L = lambda * L_objective + L_RL
+        def optimizer(parameters: list[nn.Parameter]) -> th.optim.Optimizer:
+            return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
         trained_with_critic = list(self.critic.parameters())
+        self.objective_optimizer = None
         if self.objective is not None:
-            trained_with_critic += [parameter for parameter in self.objective.parameters() if parameter.requires_grad]
-        for network, parameters in ((self.critic, trained_with_critic), (self.actor, self.actor.own_parameters())):
-            network.optimizer = self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+            own = [parameter for parameter in self.objective.parameters() if parameter.requires_grad]
+            if self.objective.own_optimizer:
+                self.objective_optimizer = optimizer(self.critic.encoder_parameters() + own)
+            else:
+                # One optimizer for one summed loss: L = lambda * L_objective + L_RL
+                trained_with_critic += own
+        self.critic.optimizer = optimizer(trained_with_critic)
+        self.actor.optimizer = optimizer(self.actor.own_parameters())
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)

@@ -18,10 +18,19 @@ class Preparation:
     :param augmentation_pad: Random shift of images, in pixels; 0 for none
     :param n_augmentations: Augmentations of each observation
     :param n_target_augmentations: Augmentations of each next observation
+    :param bfloat16: The trunks compute in lower precision
     """
 
-    def __init__(self, policy: Any, augmentation_pad: int, n_augmentations: int, n_target_augmentations: int):
+    def __init__(
+        self,
+        policy: Any,
+        augmentation_pad: int,
+        n_augmentations: int,
+        n_target_augmentations: int,
+        bfloat16: bool = False,
+    ):
         self._policy = policy
+        self._bfloat16 = bfloat16
         self._augment = RandomShift(augmentation_pad)
         self._image_keys = _find_image_keys(policy)
         #: Names of the augmentations of o_t and of o_{t+1}
@@ -79,7 +88,7 @@ class Preparation:
             data["past_gaps"] = _first_half(replay_data.past_gaps)
 
     def _views(self, frames: dict[str, Any], data: dict[str, th.Tensor]) -> Views:
-        return Views(self._policy.critic, self._policy.critic_target, frames, data)
+        return Views(self._policy.critic, self._policy.critic_target, frames, data, self._bfloat16)
 
 
 def _find_image_keys(policy: Any) -> list[str]:

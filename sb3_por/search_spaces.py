@@ -22,17 +22,13 @@ def common(trial: optuna.Trial) -> dict[str, Any]:
     }
 
 
-def _weight(trial: optuna.Trial, name: str) -> float:
-    """Of an objective beside the critic's loss, which grows with the square of ``reward_scale``: 400 times in our settings."""
-    return trial.suggest_float(name, 0.1, 1000.0, log=True)
-
-
 def partial_order(trial: optuna.Trial) -> dict[str, Any]:
     """
     :return: lambda, m (of 50 features), k, pairing and head of the partial-order objective
     """
     return {
-        "por_coef": _weight(trial, "por_coef"),
+        # Beside the critic's loss, which grows with the square of ``reward_scale``: 400 times in our settings
+        "por_coef": trial.suggest_float("por_coef", 0.1, 1000.0, log=True),
         "order_dim": trial.suggest_categorical("order_dim", [1, 5, 10, 25, 40]),
         "k": trial.suggest_int("k", 1, 5),
         "random_k": trial.suggest_categorical("random_k", [False, True]),
@@ -51,19 +47,23 @@ def augmentations(trial: optuna.Trial) -> dict[str, Any]:
     }
 
 
+def _aux_lr_ratio(trial: optuna.Trial) -> float:
+    return trial.suggest_float("aux_lr_ratio", 0.1, 10.0, log=True)
+
+
 def contrastive(trial: optuna.Trial) -> dict[str, Any]:
     """
-    :return: weight of CURL's loss
+    :return: step size of CURL's loss
     """
-    return {"curl_coef": _weight(trial, "curl_coef")}
+    return {"aux_lr_ratio": _aux_lr_ratio(trial)}
 
 
 def self_predictive(trial: optuna.Trial) -> dict[str, Any]:
     """
-    :return: weight and horizon of SPR's loss
+    :return: step size and horizon of SPR's loss
     """
     return {
-        "spr_coef": _weight(trial, "spr_coef"),
+        "aux_lr_ratio": _aux_lr_ratio(trial),
         "horizon": trial.suggest_int("horizon", 1, 5),
     }
 

@@ -33,11 +33,20 @@ class Views:
         augmentation of o_t), ``"window"`` (o_{t+1..t+K})
     :param data: Other tensors by name that the objective may use: ``"actions"``, ``"past_gaps"``,
         ``"window_actions"``, ``"window_mask"``
+    :param bfloat16: The trunks compute in lower precision; what they return is float32
     """
 
-    def __init__(self, critic: Any, critic_target: Any, frames: dict[str, Any], data: dict[str, th.Tensor] | None = None):
+    def __init__(
+        self,
+        critic: Any,
+        critic_target: Any,
+        frames: dict[str, Any],
+        data: dict[str, th.Tensor] | None = None,
+        bfloat16: bool = False,
+    ):
         self.critic = critic
         self.critic_target = critic_target
+        self.bfloat16 = bfloat16
         self.frames = frames
         self.data = data or {}
         self.batch_size = len(next(iter(frames["obs"].values())) if isinstance(frames["obs"], dict) else frames["obs"])
@@ -58,7 +67,7 @@ class Views:
             pieces = [self._trunks[id(frame)]] if id(frame) in self._trunks else []
             n_encoded = sum(len(piece) for piece in pieces)
             if n_encoded < first:
-                pieces.append(self.critic.trunk(take_rows(frame, slice(n_encoded, first))))
+                pieces.append(self.trunk_of(self.critic, take_rows(frame, slice(n_encoded, first))))
                 self._trunks[id(frame)] = pieces[0] if len(pieces) == 1 else th.cat(pieces)
             self._features[id(frame), first] = self.critic.projection(self._trunks[id(frame)][:first])
         return self._features[id(frame), first]
@@ -77,8 +86,21 @@ class Views:
                 return self._momentum[id(frame)][rows]
             return self._encode_momentum(take_rows(frame, rows))
 
+    def trunk_of(self, network: Any, observations: Any) -> th.Tensor:
+        """
+        :param network: A critic or an actor
+        :param observations: Preprocessed observations
+        :return: The features of its trunk, float32, shape ``(rows, trunk_dim)``
+        """
+        if not self.bfloat16:
+            return network.trunk(observations)
+        device = next(network.parameters()).device.type
+        # Without the cache, which would keep weights that were cast where no gradient was wanted
+        with th.autocast(device, th.bfloat16, cache_enabled=False):
+            return network.trunk(observations).float()
+
     def _encode_momentum(self, observations: Any) -> th.Tensor:
-        return self.critic_target.projection(self.critic_target.trunk(observations))
+        return self.critic_target.projection(self.trunk_of(self.critic_target, observations))
 
     def trunk(self, name: str) -> th.Tensor:
         """
@@ -90,5 +112,5 @@ class Views:
         pieces = [] if encoded is None else [encoded.detach()]
         if n_encoded < self.batch_size:
             with th.no_grad():
-                pieces.append(self.critic.trunk(take_rows(self.frames[name], slice(n_encoded, None))))
+                pieces.append(self.trunk_of(self.critic, take_rows(self.frames[name], slice(n_encoded, None))))
         return pieces[0] if len(pieces) == 1 else th.cat(pieces)

@@ -55,7 +55,7 @@ class VisualSAC(VisualActorCritic, SAC):
     :param n_target_augmentations: Augmentations of each next observation, whose targets are averaged (DrQ's K)
     :param diagnostics_interval: Log the objective's control and the losses' gradient norms every that many updates
     :param overlap: Train while the environments make the next step; pays with worker processes (``SubprocVecEnv``)
-    :param precision: Of the updates: ``"float32"``, ``"tf32"`` or ``"bfloat16"`` (automatic mixed precision)
+    :param precision: Of the updates: ``"float32"``, ``"tf32"`` or ``"bfloat16"`` (trunks only)
     :param compile_mode: Compile the networks with this mode of ``torch.compile``; None for none
     :param _init_setup_model: Whether to build the networks at the creation of the instance
     """

@@ -8,7 +8,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from torch import nn
 from toy_envs import DotEnv
 
-from sb3_por import ALGORITHMS, SACCURL, SACSPR, TQCPOR, SACDrQ, VisualTQC
+from sb3_por import ALGORITHMS, SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualTQC
 from sb3_por.objectives import Contrastive, SelfPredictive
 from sb3_por.views import Views
 
@@ -170,9 +170,29 @@ def test_drq_has_one_tau_and_two_augmentations_of_each():
 
 
 @pytest.mark.parametrize("cls", [SACCURL, SACSPR])
-def test_weights_of_the_objectives_can_be_set(cls):
-    name = {SACCURL: "curl_coef", SACSPR: "spr_coef"}[cls]
-    assert make_model(cls, **{name: 0.3}).objective_coef == 0.3
+def test_the_critic_cannot_drown_out_an_objective_with_an_optimizer_of_its_own(cls):
+    moved = []
+    for reward_scale in (1.0, 1e6):
+        model = make_model(cls, reward_scale=reward_scale, aux_lr_ratio=0.5, learning_rate=1e-3).learn(21)
+        optimizer, critic_optimizer = model.policy.objective_optimizer, model.critic.optimizer
+        assert optimizer.param_groups[0]["lr"] == 0.5 * critic_optimizer.param_groups[0]["lr"]
+        owned = {id(parameter) for parameter in optimizer.param_groups[0]["params"]}
+        trained = [*model.critic.encoder_parameters(), *model.policy.objective.parameters()]
+        assert owned == {id(parameter) for parameter in trained if parameter.requires_grad}
+        critic_optimizer.step = lambda: None
+        before = [parameter.detach().clone() for parameter in model.critic.encoder_parameters()]
+        model.train(1, 8)
+        after = model.critic.encoder_parameters()
+        moved.append(max((a - b).abs().max().item() for a, b in zip(after, before, strict=True)))
+    # Adam's steps are as large as its learning rate, whatever else pulls
+    assert moved[0] == pytest.approx(moved[1], rel=0.5) and 1e-4 < moved[1] < 3e-3
+
+
+def test_an_objective_without_one_is_trained_with_the_critic():
+    model = make_model(SACPOR)
+    assert model.policy.objective_optimizer is None
+    owned = {id(parameter) for parameter in model.critic.optimizer.param_groups[0]["params"]}
+    assert {id(parameter) for parameter in model.policy.objective.parameters()} <= owned
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

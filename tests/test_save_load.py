@@ -3,6 +3,7 @@
 import copy
 import zipfile
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -10,7 +11,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
 from toy_envs import DotEnv
 
-from sb3_por import SACPOR, VisualSAC
+from sb3_por import SACCURL, SACPOR, VisualSAC
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
@@ -76,10 +77,11 @@ def assert_same_buffer(buffer, other):
     [
         (SACPOR, dict()),
         (SACPOR, dict(k=3, random_k=True, order_head="difference", diagnostics_interval=7)),
+        (SACCURL, dict(aux_lr_ratio=0.5)),
         (VisualSAC, dict(use_sde=True)),
         (VisualSAC, dict(ent_coef=0.1, n_steps=3)),
     ],
-    ids=["por", "por-k3", "sde", "fixed-temperature"],
+    ids=["por", "por-k3", "curl", "sde", "fixed-temperature"],
 )
 def test_300_steps_save_load_300_more_equals_600_in_one_go(cls, kwargs, tmp_path):
     in_one_go = make_model(cls, make_env(), **kwargs).learn(600)
@@ -196,3 +198,19 @@ def test_a_second_learn_does_not_end_the_episode_that_it_cuts_off():
     model = make_model(SACPOR, make_env(), optimize_memory_usage=True).learn(20)
     model.learn(20, reset_num_timesteps=False)
     assert not model.replay_buffer.dones[9].any()  # where the first call ended, half-way through an episode
+
+
+def test_a_seed_given_at_loading_decides_what_follows(tmp_path):
+    model = VisualSAC("MlpPolicy", "Pendulum-v1", buffer_size=100, learning_starts=1000, seed=0).learn(10)
+    model.save(tmp_path / "model")
+
+    def go_on(**kwargs):
+        loaded = VisualSAC.load(tmp_path / "model", env=gym.make("Pendulum-v1"), **kwargs)
+        return loaded.learn(10, reset_num_timesteps=False).replay_buffer.actions[:10].tolist()
+
+    assert go_on() == go_on()
+    assert go_on(seed=1) == go_on(seed=1)
+    assert len({str(go_on()), str(go_on(seed=1)), str(go_on(seed=2))}) == 3
+    reseeded = VisualSAC.load(tmp_path / "model", env=gym.make("Pendulum-v1"))
+    reseeded.set_random_seed(1)
+    assert reseeded.rng_state is None

@@ -16,7 +16,7 @@ from stable_baselines3.her import HerReplayBuffer
 from torch import nn
 from toy_envs import DotEnv
 
-from sb3_por import SACPOR, VisualSAC, VisualTQC
+from sb3_por import SACCURL, SACPOR, VisualSAC, VisualTQC
 
 CLASSES = [VisualSAC, SACPOR, VisualTQC]
 SMALL = dict(net_arch=[8])
@@ -66,6 +66,21 @@ def test_several_environments_and_n_steps(cls):
     assert isinstance(model.replay_buffer, NStepReplayBuffer)
     assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (3, 0.98)
     model.learn(40)
+
+
+def test_an_objective_that_needs_no_later_frame_takes_any_buffer_and_any_returns():
+    model = make_model(
+        SACCURL, replay_buffer_class=NStepReplayBuffer, replay_buffer_kwargs=dict(n_steps=3, gamma=0.99), n_steps=3
+    )
+    model.learn(20)
+    with pytest.raises(ValueError, match="cannot sample the later frames that SACPOR needs"):
+        make_model(SACPOR, replay_buffer_class=NStepReplayBuffer, replay_buffer_kwargs=dict(n_steps=3, gamma=0.99), n_steps=3)
+
+
+def test_the_first_q_network_can_be_asked_alone():
+    model = make_model(VisualSAC)
+    obs, actions = th.randn(4, 3), th.randn(4, 1)
+    assert th.equal(model.critic.q1_forward(obs, actions), model.critic(obs, actions)[0])
 
 
 @pytest.mark.parametrize("share", [True, False])

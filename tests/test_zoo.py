@@ -212,7 +212,7 @@ def test_hyperparameter_files_hold_numbers_where_they_mean_numbers(file):
 @pytest.mark.parametrize("folder", [".", "paper"])
 def test_rivals_differ_by_what_belongs_to_their_methods_alone(folder):
     files = (ROOT / "zoo_hyperparams" / folder / f"{algo}.yml" for algo in ALGORITHMS)
-    own = {"por_coef", "curl_coef", "spr_coef", "pairing", "n_augmentations", "n_target_augmentations"}
+    own = {"por_coef", "aux_lr_ratio", "pairing", "n_augmentations", "n_target_augmentations"}
     first, *others = [
         {
             env: {key: value for key, value in settings.items() if key not in own}

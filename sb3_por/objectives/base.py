@@ -28,6 +28,9 @@ class Objective(nn.Module, ABC):
     window: int = 0
     #: Whether the objective needs ``"positive"``, another augmentation of the observation
     positive: bool = False
+    #: Whether an optimizer of its own steps the encoder and the objective; otherwise its weighted loss is added to the
+    #: critic's. Adam's steps do not know how large a loss is, so that the critic cannot drown out an objective that has one
+    own_optimizer: bool = False
 
     def __init__(self, features_dim: int, action_dim: int):
         super().__init__()

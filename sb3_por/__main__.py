@@ -7,9 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
-
-from sb3_por.errors import UserError, check_known, exit_code
+from sb3_por.errors import UserError, exit_code
 
 
 class Parser(argparse.ArgumentParser):
@@ -53,14 +51,14 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """The model that the arguments name and the environment that it was trained in."""
     import softbody_envs  # noqa: F401  (registers its ids)
-
-    check_known("environment", args.env, gym.registry)
+    from sb3_por.loading import find_environment, load_model, trained_in
     from sb3_por.reference import REFERENCES
 
+    if args.seed < 0:
+        raise UserError(f"--seed must not be negative, got {args.seed}")
+    args.env = find_environment(args.env, None if args.model in REFERENCES else args.model)
     if args.model in REFERENCES:
         return REFERENCES[args.model](args.env), {}
-    from sb3_por.loading import load_model, trained_in
-
     return load_model(args.model, args.algo), trained_in(args.model, args.env)
 
 

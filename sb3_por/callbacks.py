@@ -153,6 +153,25 @@ class EvaluationCallback(EvalCallback):
         self.logger.dump(self.num_timesteps)
 
 
+class SaveBestStatistics(BaseCallback):
+    """
+    Keeps the ``VecNormalize`` statistics that the best model was evaluated with; those at the end are others.
+
+    :param path: of the file
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def _on_step(self) -> bool:
+        statistics = self.model.get_vec_normalize_env()
+        if statistics is not None:
+            with atomic_write(self.path) as temporary:
+                statistics.save(str(temporary))
+        return True
+
+
 class CheckpointCallback(BaseCallback):
     """
     At regular intervals, saves the model as ``rl_model_<steps>_steps.zip`` and all that a killed run needs to go on.

@@ -139,9 +139,12 @@ def plot_all(
             grid.note(f"no figure {kind}: {error}")
     notes = grid.notes
     if order is not None:
-        figure, left_out = plot_order(order)
-        drawn.append(figure)
-        notes = [*notes, *left_out]
+        try:
+            figure, left_out = plot_order(order)
+            drawn.append(figure)
+            notes = [*notes, *left_out]
+        except UserError as error:
+            notes = [*notes, f"no figure {ORDER}: {error}"]
     return [one for one in drawn if one is not None], notes
 
 

@@ -49,6 +49,8 @@ def film(
     path = check_film(path)
     if n_episodes < 1:
         raise UserError(f"a film needs at least 1 episode, got {n_episodes}")
+    if size < 1:
+        raise UserError(f"a film needs at least 1 pixel, got the size {size}")
     drawn: dict[str, Any] = {"render_mode": "rgb_array"} | ({"render_size": size} if env_id in ENV_IDS else {})
     kwargs = (env_kwargs or {}) | drawn
     env = make_evaluation_env(model, env_id, kwargs, vec_normalize, lambda inner: RenderCollection(inner, reset_clean=False))

@@ -1,15 +1,17 @@
 """Load any saved model for use: find its algorithm, name what is wrong with the file, allocate no replay buffer."""
 
+import importlib
 import inspect
 import json
 import pickle
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import sb3_contrib
 import stable_baselines3
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -17,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_por import ALGORITHMS
 from sb3_por.errors import UserError, check_known, one_line
 from sb3_por.evaluation import whole_episodes
-from sb3_por.runs import read_settings
+from sb3_por.runs import BEST_STATISTICS, read_settings, run_arguments, the_run
 
 #: name -> class of every algorithm whose models can be loaded; a DDPG model is a TD3 model with other settings
 LOADABLE: dict[str, type[BaseAlgorithm]] = {
@@ -66,12 +68,12 @@ def load_model(path: str | Path, algo: str | None = None, device: str = "auto") 
 
 def model_file(path: str | Path) -> Path:
     """
-    :param path: a model's ``.zip``, or a run folder, which stands for its ``best_model.zip``
+    :param path: a model's ``.zip``, or a run folder or one with a single run in it, which stands for its ``best_model.zip``
     :raises UserError: if there is no such file
     """
     path = Path(path)
     if path.is_dir():
-        path = path / "best_model.zip"
+        path = the_run(path) / "best_model.zip"
     if not path.is_file():
         raise UserError(f"there is no model {path}; give a .zip that train.py or model.save() wrote")
     return path
@@ -85,13 +87,44 @@ def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
     :param env_id: the environment
     :return: the arguments ``env_kwargs`` and ``vec_normalize`` of :func:`sb3_por.evaluation.evaluate` and its likes
     """
-    folder = model_file(path).parent / env_id
+    file = model_file(path)
+    folder = file.parent / env_id
     env_kwargs = read_settings(folder / "config.yml").get("env_kwargs")
-    statistics = folder / "vecnormalize.pkl"
+    of_best = folder / BEST_STATISTICS
+    statistics = of_best if file.name == "best_model.zip" and of_best.is_file() else folder / "vecnormalize.pkl"
     return {
         "env_kwargs": whole_episodes(env_kwargs) if isinstance(env_kwargs, dict) else {},
         "vec_normalize": str(statistics) if statistics.is_file() else None,
     }
+
+
+def import_packages(names: Iterable[str]) -> None:
+    """
+    :param names: modules that register environments
+    :raises UserError: if one cannot be imported
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise UserError(f"cannot import the package {name}: {one_line(error)}") from error
+
+
+def find_environment(env_id: str, model: str | Path | None = None) -> str:
+    """
+    Import what registers an environment: the package in its name (``"package:Name-v0"``), and those that a run was given.
+
+    :param env_id: a Gymnasium id, perhaps with a package
+    :param model: as :func:`load_model` takes it
+    :return: the id without the package
+    :raises UserError: if there is no such environment
+    """
+    package, _, name = env_id.rpartition(":")
+    import_packages([package] if package else [])
+    if model is not None:
+        import_packages(run_arguments(model_file(model).parent).get("gym_packages") or [])
+    check_known("environment", name, gym.registry)
+    return name
 
 
 def read_data(path: Path) -> dict[str, Any]:

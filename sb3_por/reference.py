@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_por.errors import UserError, check_known, one_line
+from softbody_envs.experts import EXPERT_IDS, make_expert
 from softbody_envs.registration import ENV_IDS
 
 
@@ -37,6 +38,8 @@ class IdleModel:
 
     def __init__(self, env_id: str) -> None:
         self.observation_space, self.action_space = _spaces(env_id)
+        if not isinstance(self.action_space, gym.spaces.Box):
+            raise UserError(f"{env_id} has no middle of its actions, {self.action_space}, to do nothing with")
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
@@ -53,9 +56,7 @@ class ExpertModel:
     """
 
     def __init__(self, env_id: str) -> None:
-        from softbody_envs.experts import make_expert
-
-        check_known("environment with an expert", env_id, ENV_IDS)
+        check_known("environment with an expert", env_id, EXPERT_IDS)
         self.observation_space, self.action_space = _spaces(env_id)
         self._make_expert = lambda: make_expert(env_id)
         self._experts: list[Any] = []

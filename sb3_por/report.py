@@ -19,7 +19,7 @@ from sb3_por.files import atomic_write, check_writable
 from sb3_por.film import film
 from sb3_por.grids import in_order
 from sb3_por.inventory import RunFacts, orphaned_logs, take_inventory
-from sb3_por.loading import LOADABLE, load_model, trained_in
+from sb3_por.loading import LOADABLE, find_environment, load_model, trained_in
 from sb3_por.order_logs import find_order
 from sb3_por.plots import LABELS
 from sb3_por.runs import EVALUATIONS
@@ -228,6 +228,7 @@ def _show_models(best: Iterator[tuple[str, str, RunFacts, float]], notes: list[s
         with TemporaryDirectory() as folder:
             path = Path(folder) / "film.gif"
             try:
+                find_environment(env, run.folder)
                 model = load_model(run.folder, algo if algo in LOADABLE else None)
                 environment = trained_in(run.folder, env)
                 film(model, env, path, size=FILM_SIZE, **environment)

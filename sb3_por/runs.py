@@ -19,6 +19,8 @@ from sb3_por.errors import UserError, one_line
 from sb3_por.files import atomic_write
 
 EVALUATIONS = "evaluations.npz"
+#: ``VecNormalize`` statistics of the best model, beside the last one's, which the zoo calls ``vecnormalize.pkl``.
+BEST_STATISTICS = "best_vecnormalize.pkl"
 #: Folder of what a killed run goes on from; a finished run has none.
 CHECKPOINTS = "checkpoint"
 
@@ -52,6 +54,12 @@ def run_arguments(run: Path) -> dict[str, Any]:
     """The command-line arguments of a run; empty if they were not recorded."""
     files = sorted(run.glob("*/args.yml"))
     return read_settings(files[0]) if files else {}
+
+
+def the_run(folder: Path) -> Path:
+    """A run's folder, or the single run below a folder, as suites have them; the folder itself if there is none or many."""
+    below = [] if any(folder.glob("*/args.yml")) else list(folder.glob("*/*/*/args.yml"))
+    return below[0].parent.parent if len(below) == 1 else folder
 
 
 def is_finished(run: Path, env_id: str) -> bool:

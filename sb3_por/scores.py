@@ -41,7 +41,10 @@ def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:
     doubled = pd.concat([runs[runs.duplicated()], rows[rows.duplicated([*RUN_KEYS, "step"])]])
     if len(doubled):
         env, algo, seed = doubled.iloc[0][RUN_KEYS]
-        raise UserError(f"there are two runs of {algo} on {env} with seed {seed}; give one of them")
+        raise UserError(
+            f"there are two runs of {algo} on {env} with seed {seed}; give one of them, or tell them apart: train.py --label "
+            "NAME, or label: NAME in the run's args.yml"
+        )
     return rows.sort_values([*RUN_KEYS, "step"], kind="stable", ignore_index=True)
 
 

@@ -9,6 +9,7 @@ import pandas as pd
 from rliable import library as rly
 from scipy.stats import trim_mean
 
+from sb3_por.errors import UserError
 from sb3_por.grids import STATE_ALGOS, Grid, read_grid
 from sb3_por.order_logs import ORDER_METRICS
 
@@ -62,9 +63,15 @@ def task_curves(grid: Grid) -> pd.DataFrame:
             if not runs:
                 grid.note(f"{algo} was not run on {env}")
                 continue
-            steps, scores = grid.table(runs, f"{algo} on {env}")
+            try:
+                steps, scores = grid.table(runs, f"{algo} on {env}")
+            except UserError as error:
+                grid.note(f"left out: {error}")
+                continue
             columns = {"mean": scores.mean(axis=0), "std": scores.std(axis=0), "seeds": len(runs)}
             tables.append(pd.DataFrame({"env": env, "algo": algo, "step": steps, **columns}))
+    if not tables:
+        raise UserError("; ".join(grid.notes))
     return pd.concat(tables, ignore_index=True)
 
 

@@ -10,7 +10,7 @@ import yaml
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por.errors import UserError, check_known, one_line
-from sb3_por.loading import LOADABLE
+from sb3_por.loading import LOADABLE, import_packages
 from sb3_por.runs import is_finished, run_arguments
 
 
@@ -29,6 +29,7 @@ class Suite:
     :param hyperparams: changes to the settings of all runs
     :param variants: name -> the algorithm (``algo``) that runs under this name, and changes to its settings
     :param overrides: algorithm, environment, or ``algorithm/environment`` -> changes to the settings of its runs
+    :param gym_packages: modules that register environments
     :param workers: processes at a time on this machine; the number of cores divided by ``threads`` if ``None``
     :param threads: PyTorch threads of a run, and the CPUs that it takes of a Ray cluster
     :param gpus: GPUs that a run takes of a Ray cluster; 0.5 puts two runs on one
@@ -44,6 +45,7 @@ class Suite:
     hyperparams: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
     overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
+    gym_packages: list[str] = field(default_factory=list)
     workers: int | None = None
     threads: int = 1
     gpus: float = 0
@@ -104,6 +106,7 @@ def suite_runs(suite: Suite, root: Path) -> list[Run]:
     if suite.n_timesteps is not None:
         frequencies["-n"] = suite.n_timesteps
     common = [part for flag, value in frequencies.items() for part in (flag, str(value))]
+    packages = ["--gym-packages", *suite.gym_packages] if suite.gym_packages else []
     runs = []
     for seed in suite.seeds:
         for env in suite.envs:
@@ -118,7 +121,7 @@ def suite_runs(suite: Suite, root: Path) -> list[Run]:
                 for key in narrow:
                     changes |= suite.overrides.get(key, {})
                 params = ["-params", *(f"{name}:{value!r}" for name, value in changes.items())] if changes else []
-                flags = [*common, "--num-threads", str(suite.threads), *params]
+                flags = [*common, "--num-threads", str(suite.threads), *packages, *params]
                 folder = root / env / name / f"seed_{seed}"
                 runs.append(Run(algo, env, seed, folder, tuple(flags), variant=name if name in suite.variants else ""))
     return runs
@@ -130,6 +133,7 @@ _EXAMPLES = {
     "algos": "[sac_por, sac]",
     "envs": "[PourWater-v0]",
     "seeds": "[0, 1, 2]",
+    "gym_packages": "[my_package]",
     "hyperparams": "{batch_size: 128}",
     "variants": "{por_paper: {algo: sac_por, pairing: paper}}",
     "overrides": "{sac_por: {k: 3}}",
@@ -185,6 +189,8 @@ class _Checks:
                 raise UserError(f"{self.path} has no {name}; add a line such as {name}: {_EXAMPLES[name]}")
         for name, of_name in nodes.items():
             self._type(of_name, name, values[name])
+            self._numbers(of_name)
+        import_packages(values.get("gym_packages", []))
         if "variants" in nodes:
             self._variants(nodes["variants"], values["variants"])
         algos = [*LOADABLE, *values.get("variants", {})]
@@ -215,8 +221,16 @@ class _Checks:
                 lines[key.value] = key.start_mark.line + 1
                 self._no_key_twice(value)
 
+    def _numbers(self, node: yaml.Node) -> None:
+        """YAML reads 1e-3, without a point, as a string."""
+        if isinstance(node, yaml.MappingNode):
+            for _, value in node.value:
+                self._numbers(value)
+        elif isinstance(node, yaml.ScalarNode) and node.style is None and _is_number_without_point(node):
+            self._fail(node, f"YAML reads {node.value} as text; write the number with a point, such as {float(node.value)!r}")
+
     def _type(self, node: yaml.Node, name: str, value: Any) -> None:
-        if name in _REQUIRED:
+        if name in (*_REQUIRED, "gym_packages"):
             self._list(node, name, value)
         elif name in ("hyperparams", "variants", "overrides"):
             inner = value.values() if name != "hyperparams" and isinstance(value, dict) else []
@@ -248,6 +262,16 @@ class _Checks:
         for i, one in enumerate(value):
             if one in value[:i]:
                 self._fail(node.value[i], f"{name} has {one} twice; keep one")
+
+
+def _is_number_without_point(node: yaml.ScalarNode) -> bool:
+    if node.tag != "tag:yaml.org,2002:str":
+        return False
+    try:
+        float(node.value)
+    except ValueError:
+        return False
+    return True
 
 
 def _is_seed(value: Any) -> bool:

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import rl_zoo3.train
 import yaml
 from filelock import FileLock, Timeout
 from gymnasium import spaces
 from rl_zoo3 import ALGOS
-from rl_zoo3.callbacks import SaveVecNormalizeCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import StoreDict, get_latest_run_id
@@ -32,7 +32,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import ALGORITHMS
-from sb3_por.callbacks import CheckpointCallback, EvaluationCallback, Stopwatch
+from sb3_por.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
 from sb3_por.checkpoints import (
     latest_checkpoint,
     read_rng_state,
@@ -44,8 +44,16 @@ from sb3_por.checkpoints import (
 from sb3_por.errors import UserError, check_known, exit_code, one_line
 from sb3_por.evaluation import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
 from sb3_por.files import atomic_write, check_writable, remove_unfinished
-from sb3_por.loading import model_file, quiet_n_steps, read_data
-from sb3_por.runs import current_commit, current_machine, read_settings, run_arguments, write_settings
+from sb3_por.loading import find_environment, import_packages, model_file, quiet_n_steps, read_data
+from sb3_por.runs import (
+    BEST_STATISTICS,
+    current_commit,
+    current_machine,
+    read_settings,
+    run_arguments,
+    the_run,
+    write_settings,
+)
 from sb3_por.search_spaces import sampler
 
 EXAMPLE = """example:
@@ -93,6 +101,9 @@ class Settings(StoreDict):
             try:
                 super().__call__(parser, one, [pair], option_string)
                 stored |= getattr(one, self.dest)
+                key, _, word = pair.partition(":")
+                if word.isidentifier() and callable(stored[key]):
+                    stored[key] = word  # obs_type:dict means the word, not Python's dict
             except (NameError, SyntaxError):
                 key, colon, word = pair.partition(":")
                 if not colon or not word:
@@ -130,8 +141,8 @@ class Parser(argparse.ArgumentParser):
         if args.track and importlib.util.find_spec("wandb") is None:
             raise UserError("--track needs Weights & Biases: pip install wandb")
         check_known("algorithm", args.algo, ALGOS)
-        _import_packages(args.gym_packages)
-        check_known("environment", args.env, gym.registry)
+        import_packages(args.gym_packages)
+        args.env = find_environment(args.env)
         if args.trained_agent:
             args.trained_agent = str(model_file(args.trained_agent))
             read_data(Path(args.trained_agent))
@@ -145,26 +156,20 @@ class Parser(argparse.ArgumentParser):
 
     def _resumed(self, run: Path) -> argparse.Namespace:
         """The arguments that a run was started with, changed by those given now."""
+        run = the_run(run)
         saved = run_arguments(run)
         if "env" not in saved:
             raise UserError(f"{run} is not the folder of a run: no */args.yml in it; give <log-folder>/<algo>/<env>_<n>")
         if (run / f"{saved['env']}.zip").exists() and latest_checkpoint(run) is None:
             remove_checkpoints(run)  # what is left of them if the run was killed while it removed them
-            print(f"{run} is finished: nothing to do")
+            print(f"{run} is finished: nothing to do (train.py -i MODEL.zip begins a new run with its model)")
             raise SystemExit(0)
         self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
         args = super().parse_args()
-        _import_packages(args.gym_packages)
+        args.resume = str(run)
+        import_packages(args.gym_packages)
         check_writable(run)
         return args
-
-
-def _import_packages(names: list[str]) -> None:
-    for name in names:
-        try:
-            importlib.import_module(name)
-        except ImportError as error:
-            raise UserError(f"--gym-packages: {one_line(error)}") from error
 
 
 def hyperparameter_file(algo: str, env_id: str) -> Path:
@@ -203,7 +208,14 @@ def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
     # MlpPolicy flattens images, which works, however badly.
     fits = policy == needed or (policy == "MlpPolicy" and needed == "CnnPolicy")
     if policy in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy") and not fits:
-        raise UserError(f"{policy} cannot read the observations of {env_id}, {space}; pass -params policy:{needed}")
+        alone = " policy_kwargs:{}" if needed == "MlpPolicy" else ""  # the settings may have those of convolutions
+        raise UserError(f"{policy} cannot read the observations of {env_id}, {space}; pass -params policy:{needed}{alone}")
+    if policy != needed and policy == "MlpPolicy":
+        print(
+            f"note: MlpPolicy flattens the images of {env_id} into {np.prod(space.shape)} numbers; you may want "  # type: ignore[arg-type]
+            "-params policy:CnnPolicy, or --env-kwargs obs_type:state where the environment has it",
+            file=sys.stderr,
+        )
 
 
 class Experiment(ExperimentManager):
@@ -221,8 +233,10 @@ class Experiment(ExperimentManager):
             self.continue_training = True
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """``--env-kwargs`` adds to the file's (the zoo's replaces them all), and evaluation gets them too."""
-        given, self.env_kwargs = self.env_kwargs, {}
+        """``--env-kwargs`` and ``-params env_kwargs:`` add to the file's (the zoo's replace them), also in evaluation."""
+        changes = dict(self.custom_hyperparams or {})
+        given, self.env_kwargs = {**(changes.pop("env_kwargs", None) or {}), **self.env_kwargs}, {}
+        self.custom_hyperparams = changes
         if self._resumed_run is None:
             hyperparams, saved = super().read_hyperparameters()
         else:
@@ -304,7 +318,7 @@ class Experiment(ExperimentManager):
                     self.eval_freq,
                     self.save_path,
                     stopwatch,
-                    callback_on_new_best=SaveVecNormalizeCallback(save_freq=1, save_path=self.params_path),
+                    callback_on_new_best=SaveBestStatistics(Path(self.params_path) / BEST_STATISTICS),
                     verbose=self.verbose,
                 )
             )

@@ -91,6 +91,11 @@ def test_a_figure_of_nothing_is_refused_and_left_out_of_all():
     plots, notes = plot_all(alone, reps=20)
     assert [one.name for one in plots] == ["iqm", "tasks", "aggregates", "profile"]
     assert any("no probability of improvement" in note for note in notes) and any("no ratio" in note for note in notes)
+    short = random_scores(algos=("c",), n_seeds=2)
+    short.loc[short["seed"] == 0, "step"] += 10_000
+    plots, notes = plot_all(pd.concat([alone, short]), reps=20)
+    assert "tasks" in [one.name for one in plots]
+    assert any(note.startswith("left out: c on ") and "no step in common" in note for note in notes)
     apart = pd.concat([random_scores(algos=("a",), envs=("T",)), random_scores(algos=("b",), envs=("U",))])
     plots, notes = plot_all(apart, reps=20)
     assert [one.name for one in plots] == ["iqm", "tasks"]

@@ -85,6 +85,14 @@ def test_a_variant_is_an_algorithm_with_settings_and_a_name(suite_file, tmp_path
         ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\nworkers: 0\n", "grid.yml:4: workers must be a positive integer"),
         ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\nhyperparams: 3\n", "grid.yml:4: hyperparams must be a mapping"),
         ("algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\noverrides: {td3: {}}\n", "grid.yml:4: unknown run 'td3'"),
+        (
+            "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\nhyperparams: {learning_rate: 1e-3}\n",
+            "grid.yml:4: YAML reads 1e-3 as text; write the number with a point, such as 0.001",
+        ),
+        (
+            "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\ngym_packages: [no_such_package]\n",
+            "cannot import the package no_such_package",
+        ),
         ("algos: [sac\n", "grid.yml:2: this is not YAML: expected ',' or ']'"),
         ("- sac\n", "grid.yml:1: a suite is a mapping, of at least these lines: algos: [sac_por, sac]; envs:"),
         ("algos:\n- sac\n- sacc\nenvs: [Pendulum-v1]\nseeds: [0]\n", "grid.yml:3: unknown algorithm 'sacc'"),

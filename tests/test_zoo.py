@@ -1,5 +1,7 @@
 """train.py: the zoo's command with our algorithms, tasks, evaluation and messages."""
 
+import argparse
+import json
 import os
 import signal
 import subprocess
@@ -16,10 +18,11 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_por import ALGORITHMS
+from sb3_por.__main__ import main as evaluation_main
 from sb3_por.errors import UserError
 from sb3_por.loading import load_model
 from sb3_por.scores import read_scores, run_identity
-from sb3_por.zoo import Experiment, check_policy, hyperparameter_file, main
+from sb3_por.zoo import Experiment, Settings, check_policy, hyperparameter_file, main
 from softbody_envs import ENV_IDS
 
 ROOT = Path(__file__).parent.parent
@@ -238,6 +241,44 @@ def test_policies_are_checked_against_observations():
     check_policy("CnnPolicy", image, "E-v0")
     check_policy("MlpPolicy", image, "E-v0")
     check_policy("MultiInputPolicy", gym.spaces.Dict({"image": image}), "E-v0")
+
+
+def test_a_word_is_a_word_though_python_knows_it():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--settings", nargs="+", action=Settings)
+    given = parser.parse_args(["--settings", "obs_type:dict", "pairing:paper", "gamma:0.9", "f:lambda x: x"]).settings
+    assert given.pop("f")(3) == 3
+    assert given == {"obs_type": "dict", "pairing": "paper", "gamma": 0.9}
+
+
+def test_images_that_are_flattened_are_said(capsys):
+    check_policy("MlpPolicy", gym.spaces.Box(0, 255, (40, 40, 3), np.uint8), "E-v0")
+    assert "MlpPolicy flattens the images of E-v0 into 4800 numbers" in capsys.readouterr().err
+
+
+def test_an_environment_of_ones_own_is_trained_on_and_its_model_used(tmp_path, monkeypatch, capsys):
+    package = "import gymnasium as gym\nfrom gymnasium.envs.classic_control import PendulumEnv\n"
+    package += "if 'Mine-v0' not in gym.registry:\n    gym.register('Mine-v0', PendulumEnv, max_episode_steps=20)\n"
+    (tmp_path / "of_my_own.py").write_text(package)
+    monkeypatch.syspath_prepend(tmp_path)
+    flags = ["--gym-packages", "of_my_own", "-n", "60", "--eval-freq", "30", "-f", str(tmp_path / "logs")]
+    settings = ["policy:MlpPolicy", "env_kwargs:{'g': 5.0}", "normalize:True"]
+    hyperparams = tmp_path / "mine.yml"
+    hyperparams.write_text("Mine-v0: {policy: MlpPolicy, n_timesteps: 60, env_kwargs: {render_mode: rgb_array}}\n")
+    arguments = [*PENDULUM[:2], "--env", "Mine-v0", *PENDULUM[4:], "-conf", str(hyperparams), *flags, *SMALL, *settings]
+    assert main(arguments) == 0
+    run = tmp_path / "logs" / "sac" / "Mine-v0_1"
+    assert yaml.safe_load((run / "Mine-v0" / "config.yml").read_text())["env_kwargs"] == {"g": 5.0, "render_mode": "rgb_array"}
+    capsys.readouterr()
+    gym.registry.pop("Mine-v0")
+    sys.modules.pop("of_my_own")
+    recorded = read_scores([run])["return"].max()
+    # The folder above a single run stands for it
+    for env_id, model in (("Mine-v0", run), ("of_my_own:Mine-v0", tmp_path / "logs")):
+        assert evaluation_main(["evaluate", "--model", str(model), "--env", env_id, "-n", "2", "--json"]) == 0
+        shown = json.loads(capsys.readouterr().out)
+        # The best model with the statistics of its time
+        assert shown["mean"]["return"] == pytest.approx(recorded)
 
 
 def test_help_has_an_example_and_our_defaults():

@@ -28,6 +28,9 @@ _TABLE = {
     "DropFoldCloth-v0": "drop_fold_cloth:DropFoldClothExpert",
 }
 
+#: Environments that have an expert.
+EXPERT_IDS = tuple(_TABLE)
+
 
 def make_expert(env_id: str) -> Expert:
     """

@@ -50,19 +50,20 @@ class WholeEncoder(BaseFeaturesExtractor):
         return self.projection(self.trunk(observations))
 
 
-#: Name: class, its arguments, and the encoder passes that one update needs, in batches: with gradient, without. All need
-#: o_t with gradient for the critic, o_{t+1} from the momentum encoder for the target, and from the trunk for the actor.
-ALGORITHMS: dict[str, tuple[type[Any], dict[str, Any], tuple[float, float]]] = {
+#: Name: class, its arguments, and the encoder passes that one update needs, in batches: with gradient, without, and back
+#: again through those with gradient, for an objective with an optimizer of its own. All need o_t with gradient for the
+#: critic, o_{t+1} from the momentum encoder for the target, and from the trunk for the actor.
+ALGORITHMS: dict[str, tuple[type[Any], dict[str, Any], tuple[float, float, int]]] = {
     # Actor, critic and target encode for themselves. With gradient: o_t for the actor, for the critic, and for the
     # critic's judgement of the actor, in which SB3 does not stop it. Without: o_{t+1} for the actor and for the target.
-    "sac (SB3)": (SAC, {"policy_kwargs": {"features_extractor_class": WholeEncoder}}, (3, 2)),
-    "visual_sac": (VisualSAC, {}, (1, 2)),
-    "sac_por": (SACPOR, {}, (1, 2.5)),  # half a batch of earlier frames passes the momentum encoder
-    "sac_por (paper)": (SACPOR, {"pairing": "paper"}, (1, 2)),
-    "tqc_por": (TQCPOR, {}, (1, 2.5)),
-    "sac_drq": (SACDrQ, {}, (2, 4)),
-    "sac_curl": (SACCURL, {}, (1, 3)),  # a second augmentation
-    "sac_spr": (SACSPR, {}, (1, 7)),  # a window of five frames
+    "sac (SB3)": (SAC, {"policy_kwargs": {"features_extractor_class": WholeEncoder}}, (3, 2, 0)),
+    "visual_sac": (VisualSAC, {}, (1, 2, 0)),
+    "sac_por": (SACPOR, {}, (1, 2.5, 0)),  # half a batch of earlier frames passes the momentum encoder
+    "sac_por (paper)": (SACPOR, {"pairing": "paper"}, (1, 2, 0)),
+    "tqc_por": (TQCPOR, {}, (1, 2.5, 0)),
+    "sac_drq": (SACDrQ, {}, (2, 4, 0)),
+    "sac_curl": (SACCURL, {}, (1, 3, 1)),  # a second augmentation
+    "sac_spr": (SACSPR, {}, (1, 7, 1)),  # a window of five frames
 }
 
 
@@ -89,7 +90,8 @@ def make_model(name: str, batch: int, image_size: int, device: str, options: dic
 
 def make_floor(name: str, batch: int, image_size: int, device: str) -> Callable[[], None]:
     """The bare encoder passes of one update, batch by batch, on images that are already float and on the device."""
-    trained, untrained = ([batch] * int(share) + [round(batch * (share % 1))] for share in ALGORITHMS[name][2])
+    *shares, n_again = ALGORITHMS[name][2]
+    trained, untrained = ([batch] * int(share) + [round(batch * (share % 1))] for share in shares)
     space = gym.spaces.Box(0, 255, (3, image_size, image_size), "uint8")
     encoder = WholeEncoder(space).to(device)
     images = th.rand(batch, 3, image_size, image_size, device=device)
@@ -98,7 +100,9 @@ def make_floor(name: str, batch: int, image_size: int, device: str) -> Callable[
     def passes() -> None:
         encoder.zero_grad()
         for n_images in filter(None, trained):
-            encoder(images[:n_images]).sum().backward()
+            output = encoder(images[:n_images]).sum()
+            for again in reversed(range(1 + n_again)):
+                output.backward(retain_graph=again > 0)
         with th.no_grad():
             for n_images in filter(None, untrained):
                 encoder(images[:n_images])

@@ -103,7 +103,8 @@ def diagnosis() -> str:
             str(row.seed),
             *(f"{value:.3f}" for value in (row.accuracy, row.random_accuracy, row.leak_accuracy)),
             *(f"{value:.2g}" if value < 1 else f"{value:.0f}" for value in (row.grad_norm_critic, row.grad_norm_por)),
-            f"{row.correlation:.2f}",
+            f"{row.feature_std:.3f}",
+            "-" if pd.isna(row.correlation) else f"{row.correlation:.2f}",
         )
         for row in table.sort_values(["algo", "seed"], ascending=[False, True]).itertuples()
     ]

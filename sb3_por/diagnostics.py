@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.errors import UserError
 from sb3_por.evaluation import evaluation_episodes, make_evaluation_env
-from sb3_por.loading import load_model, trained_in
+from sb3_por.loading import find_environment, load_model, trained_in
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.replay import SequenceReplayBuffer
 from sb3_por.runs import find_runs, is_finished
@@ -38,6 +38,8 @@ class Diagnosis:
     :param random_accuracy: the same as an accuracy
     :param grad_norm_critic: norm of the critic loss's gradient at the encoder
     :param grad_norm_por: norm of the weighted POR loss's gradient there
+    :param feature_std: standard deviation of the encoder's features over the policy's own frames, mean of the features; near
+        0 the encoder has collapsed: it says the same of all frames
     :param correlation: Spearman's correlation between the learned potential and ``info["monotone"]`` over an episode, mean
         of the episodes in which that quantity changes; NaN if it never does
     :param correlations: the same of each episode, NaN where the quantity is constant
@@ -51,6 +53,7 @@ class Diagnosis:
     random_accuracy: float
     grad_norm_critic: float
     grad_norm_por: float
+    feature_std: float
     correlation: float
     correlations: list[float]
 
@@ -70,6 +73,7 @@ class Diagnosis:
         table = "\n".join(f"{name:26s}{loss:>8s}{accuracy:>10s}" for name, loss, accuracy in rows)
         return (
             f"{table}\ngradient norm at the encoder: critic {self.grad_norm_critic:.3g}, POR {self.grad_norm_por:.3g}\n"
+            f"standard deviation of the encoder's features over frames: {self.feature_std:.3g}\n"
             f"Spearman correlation of potential and monotone quantity: {self.correlation:.3f}"
         )
 
@@ -123,6 +127,7 @@ def diagnose(
     with th.no_grad():
         measured = [objective.loss(view)[1] for view in views]
         leaks = [objective.control(model._preparation.control_views(batch)) for batch in batches]
+        features = th.cat([view.online("obs") for view in views])
         at_random = [objective.loss(model._preparation.views(_sample(model, random)))[1] for _ in range(N_BATCHES)]
     ent_coef = model.ent_coef_tensor if model.log_ent_coef is None else model.log_ent_coef.detach().exp()
     norms = model._encoder_grad_norms(*model._encoder_losses(batches[0], model._preparation.views(batches[0]), ent_coef))
@@ -136,6 +141,7 @@ def diagnose(
         random_accuracy=_mean(at_random, "accuracy"),
         grad_norm_critic=float(norms["critic"]),
         grad_norm_por=float(norms[objective.name]),
+        feature_std=float(features.std(dim=0).mean()),
         correlation=float(np.mean(changing)) if changing else float("nan"),
         correlations=correlations,
     )
@@ -157,6 +163,7 @@ def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int 
         file = run / f"{identity['env']}.zip"
         if not is_finished(run, identity["env"]):
             continue
+        find_environment(identity["env"], file)
         model: Any = load_model(file)
         if not isinstance(getattr(model.policy, "objective", None), PartialOrder):
             continue

@@ -63,6 +63,14 @@ def test_a_model_that_sees_image_and_state_is_diagnosed_too():
     assert -1 <= diagnose(model, "FallingBall-v0", n_episodes=1).correlation <= 1
 
 
+def test_an_encoder_that_says_the_same_of_all_frames_is_found(model_file):
+    model = load_model(model_file)
+    sound = diagnose(model, "FallingBall-v0", n_episodes=1).feature_std
+    with th.no_grad():
+        model.critic.projection.blocks[0][0].weight.zero_()
+    assert diagnose(model, "FallingBall-v0", n_episodes=1).feature_std < 1e-6 < 0.01 < sound
+
+
 def test_diagnosis_leaves_the_model_as_it_was(model):
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     diagnose(model, "FallingBall-v0", n_episodes=1)

@@ -35,6 +35,8 @@ WANTED = {
 def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """A table in Markdown."""
     lines = [tuple(head), *map(tuple, rows)]
+    if len({len(line) for line in lines}) > 1:
+        raise ValueError(f"a row has not as many cells as the head, {lines[0]}")
     lines.insert(1, ("---",) * len(lines[0]))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -116,6 +118,7 @@ def diagnosis() -> str:
         "k = 0",
         "gradient of the critic",
         "of λ POR",
+        "std of features",
         "correlation with the water",
     )
     return markdown(head, rows)

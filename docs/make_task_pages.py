@@ -19,7 +19,7 @@ import numpy as np
 import softbody_envs
 from sb3_por.evaluation import evaluate
 from sb3_por.reference import REFERENCES
-from softbody_envs.experts import make_expert
+from softbody_envs.experts import EXPERT_IDS, make_expert
 
 PAGES = Path(__file__).parent / "tasks"
 SCORES = Path(__file__).parent.parent / "results" / "tasks" / "scores.csv"
@@ -30,19 +30,10 @@ SIZES = (64, 84, 128, 480)
 FILM_SIZE, FILM_EVERY = 160, 2
 
 
-def has_expert(env_id: str) -> bool:
-    """Whether the task has a scripted solution; the diagnostics have nothing to solve."""
-    try:
-        make_expert(env_id)
-    except ValueError:
-        return False
-    return True
-
-
 def measure_scores() -> None:
     """Play held-out variations from 800 on and write the table of scores."""
     rows = []
-    for env_id in filter(has_expert, softbody_envs.ENV_IDS):
+    for env_id in EXPERT_IDS:
         for policy in ("expert", "random", "nothing"):
             result = evaluate(REFERENCES[policy](env_id), env_id, N_EPISODES)
             scores = np.array(result.normalized_performance)
@@ -59,7 +50,7 @@ def draw(env_id: str) -> None:
     """A strip of stills at the sizes of ``SIZES``, and films of expert and random play."""
     env = gym.make(env_id, obs_type="state", split="eval").unwrapped
     rng = np.random.default_rng(0)
-    for policy in ("expert", "random") if has_expert(env_id) else ("random",):
+    for policy in ("expert", "random") if env_id in EXPERT_IDS else ("random",):
         expert = make_expert(env_id) if policy == "expert" else None
         if expert is not None:
             expert.reset()
@@ -69,7 +60,7 @@ def draw(env_id: str) -> None:
         for step in range(horizon):
             if step % FILM_EVERY == 0:
                 frames.append(env._image(FILM_SIZE))
-            if step == horizon // 3 and policy in ("expert", "random")[: 1 if has_expert(env_id) else 2]:
+            if step == horizon // 3 and policy in ("expert", "random")[: 1 if env_id in EXPERT_IDS else 2]:
                 stills = [cv2.resize(env._image(size), (480, 480), interpolation=cv2.INTER_NEAREST) for size in SIZES]
                 iio.imwrite(PAGES / f"{env_id}.png", cv2.resize(np.hstack(stills), (1200, 300), interpolation=cv2.INTER_AREA))
             state = env.step(expert.act(state) if expert is not None else rng.uniform(-1, 1, env.action_space.shape))[0]

@@ -265,7 +265,7 @@ class _Checks:
 
 
 def _is_number_without_point(node: yaml.ScalarNode) -> bool:
-    if node.tag != "tag:yaml.org,2002:str":
+    if node.tag != "tag:yaml.org,2002:str" or not any(character.isdigit() for character in node.value):
         return False
     try:
         float(node.value)

@@ -240,7 +240,7 @@ class Experiment(ExperimentManager):
         if self._resumed_run is None:
             hyperparams, saved = super().read_hyperparameters()
         else:
-            saved = read_settings(self._resumed_run / self.env_name / "config.yml") | (self.custom_hyperparams or {})
+            saved = read_settings(self._resumed_run / self.env_name / "config.yml") | changes
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         held_out = evaluation_kwargs(self.env_name.gym_id)

@@ -227,9 +227,10 @@ def test_a_kill_while_checkpoints_are_removed_leaves_a_finished_run(tmp_path, mo
         with pytest.raises(OSError, match="killed here"):
             remove_checkpoints(run)
     assert (run / "checkpoint").exists() and latest_checkpoint(run) is None
-    with pytest.raises(SystemExit) as exit:
-        main(["--resume", str(run)])
-    assert exit.value.code == 0 and "is finished: nothing to do" in capsys.readouterr().out
+    for folder in (run, tmp_path):  # or one with a single run in it
+        with pytest.raises(SystemExit) as exit:
+            main(["--resume", str(folder)])
+        assert exit.value.code == 0 and f"{run} is finished: nothing to do" in capsys.readouterr().out
     assert not (run / "checkpoint").exists()
 
 
@@ -258,9 +259,10 @@ def test_resume_of_what_is_finished_no_run_or_in_use_is_said(tmp_path, capsys):
     flags = ["-n", "20", "--eval-freq", "-1", "-f", str(tmp_path)]
     assert main([*FLAGS, *flags, *SMALL]) == 0
     run = tmp_path / "sac" / "Pendulum-v1_1"
-    with pytest.raises(SystemExit) as exit:
-        main(["--resume", str(run)])
-    assert exit.value.code == 0 and "is finished: nothing to do" in capsys.readouterr().out
+    for folder in (run, tmp_path):  # or one with a single run in it
+        with pytest.raises(SystemExit) as exit:
+            main(["--resume", str(folder)])
+        assert exit.value.code == 0 and f"{run} is finished: nothing to do" in capsys.readouterr().out
     os.remove(run / "Pendulum-v1.zip")
     script = "import filelock, sys; lock = filelock.FileLock(sys.argv[1]); lock.acquire(); print(1, flush=True); input()"
     holder = subprocess.Popen([sys.executable, "-c", script, run / ".lock"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -75,6 +75,25 @@ def comparison() -> str:
     return markdown(head, rows)
 
 
+def longer() -> str:
+    """Pouring for four times as long: where each run was best, and where it ended."""
+    scores = read_scores([RESULTS / "long" / "scores.csv"])
+    rows = []
+    for (algo, seed), run in scores.groupby(["algo", "seed"]):
+        best, last = run.loc[run[METRIC].idxmax()], run.loc[run["step"].idxmax()]
+        rows.append(
+            (
+                f"`{algo}`",
+                str(seed),
+                f"{best[METRIC]:.2f} at {best['step'] / 1000:.0f}k",
+                f"{run.nlargest(4, 'step')[METRIC].mean():.2f}",
+                f"{last[METRIC]:.2f} at {last['step'] / 1000:.0f}k",
+                f"{last['wall_clock_s'] / 60:.0f}",
+            )
+        )
+    return markdown(("", "seed", "best evaluation", "mean of the last four", "last", "minutes"), rows)
+
+
 def state() -> str:
     """What SAC has reached from the state."""
     scores = read_scores([RESULTS / "state" / "scores.csv"])
@@ -146,7 +165,13 @@ def leak() -> str:
     return markdown(head, rows)
 
 
-TABLES: dict[str, Callable[[], str]] = {"comparison": comparison, "state": state, "diagnosis": diagnosis, "leak": leak}
+TABLES: dict[str, Callable[[], str]] = {
+    "comparison": comparison,
+    "longer": longer,
+    "state": state,
+    "diagnosis": diagnosis,
+    "leak": leak,
+}
 
 
 def fill_in(page: str) -> str:
@@ -161,7 +186,7 @@ def fill_in(page: str) -> str:
 
 def draw() -> None:
     """The figures of scores and of order."""
-    for suite in ("main", "state"):
+    for suite in ("main", "long", "state"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     plot_order(read_order([RESULTS / "main" / "order.csv"]))[0].save(RESULTS / "main" / "order.png")

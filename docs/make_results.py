@@ -75,9 +75,9 @@ def comparison() -> str:
     return markdown(head, rows)
 
 
-def longer() -> str:
-    """Pouring for four times as long: where each run was best, and where it ended."""
-    scores = read_scores([RESULTS / "long" / "scores.csv"])
+def courses(suite: str) -> str:
+    """A few runs, each by itself: where it was best, and where it ended."""
+    scores = read_scores([RESULTS / suite / "scores.csv"])
     rows = []
     for (algo, seed), run in scores.groupby(["algo", "seed"]):
         best, last = run.loc[run[METRIC].idxmax()], run.loc[run["step"].idxmax()]
@@ -167,7 +167,8 @@ def leak() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "comparison": comparison,
-    "longer": longer,
+    "longer": lambda: courses("long"),
+    "steady": lambda: courses("steady"),
     "state": state,
     "diagnosis": diagnosis,
     "leak": leak,
@@ -186,7 +187,7 @@ def fill_in(page: str) -> str:
 
 def draw() -> None:
     """The figures of scores and of order."""
-    for suite in ("main", "long", "state"):
+    for suite in ("main", "long", "steady", "state"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     plot_order(read_order([RESULTS / "main" / "order.csv"]))[0].save(RESULTS / "main" / "order.png")

@@ -94,6 +94,17 @@ def courses(suite: str) -> str:
     return markdown(("", "seed", "best evaluation", "mean of the last four", "last", "minutes"), rows)
 
 
+def trials() -> str:
+    """Single runs with other settings: every evaluation."""
+    scores = read_scores([RESULTS / "trials" / "scores.csv"])
+    rows = []
+    for (env_id, name, seed), run in scores.groupby(["env", "algo", "seed"]):
+        run = run.sort_values("step")
+        course = ", ".join(f"{score:.2f}" for score in run[METRIC])
+        rows.append((f"`{env_id}`", f"`{name}`", str(seed), f"{run['step'].iloc[0] / 1000:.0f}k", course))
+    return markdown(("", "label", "seed", "every", "evaluations"), rows)
+
+
 def state() -> str:
     """What SAC has reached from the state."""
     scores = read_scores([RESULTS / "state" / "scores.csv"])
@@ -169,6 +180,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "comparison": comparison,
     "longer": lambda: courses("long"),
     "steady": lambda: courses("steady"),
+    "trials": trials,
     "state": state,
     "diagnosis": diagnosis,
     "leak": leak,

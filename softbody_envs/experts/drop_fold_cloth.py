@@ -1,9 +1,17 @@
 """Lower the hanging cloth, lay its lower half on the floor, and fold the upper half over it."""
 
+from functools import partial
+
 import numpy as np
 
-from softbody_envs.experts.fold_cloth import Script, ScriptedExpert, corners, go, leave, pickers
+from softbody_envs.experts import fold_cloth
+from softbody_envs.experts.fold_cloth import Script, ScriptedExpert, corners, leave, pickers
+from softbody_envs.tasks.drop_fold_cloth import PICKER_REACH
 
+#: The cloth hangs free, so that its length can be seen, when its lower corners are this high, m.
+HANGING = 0.02
+#: How far one step lifts it until then, m.
+LIFT = 0.01
 #: Control steps of each movement.
 LOWER_STEPS = 8
 LAY_STEPS = 20
@@ -12,12 +20,16 @@ FOLD_STEPS = 16
 LEAN = 0.3
 UP = np.array([0.0, 0.0, 1.0])
 
+go = partial(fold_cloth.go, reach=PICKER_REACH)
+
 
 class DropFoldClothExpert(ScriptedExpert):
     """Folds without ever letting go."""
 
     def script(self, state: np.ndarray) -> Script:
-        """Three arcs of the held edge; the pickers stay above the corners that they hold."""
+        """Lift the cloth until it hangs, then three arcs of the held edge; the pickers stay above the corners they hold."""
+        while corners(state)[2:, 2].min() < HANGING:
+            state = yield go(pickers(state) + LIFT * UP, state, pick=True)
         held, free = corners(state)[:2], corners(state)[2:]
         grip = (pickers(state) - held) * UP
         length = np.linalg.norm(held - free, axis=1).mean()

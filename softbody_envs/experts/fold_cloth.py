@@ -53,9 +53,9 @@ def pickers(state: np.ndarray) -> np.ndarray:
     return state[12:18].reshape(2, 3)
 
 
-def go(goals: np.ndarray, state: np.ndarray, pick: bool) -> np.ndarray:
-    """The action that takes the pickers to their goals, m, ``(2, 3)``, or as near as one step can."""
-    move = np.clip((goals - pickers(state)) / REACH, -1.0, 1.0)
+def go(goals: np.ndarray, state: np.ndarray, pick: bool, reach: float = REACH) -> np.ndarray:
+    """The action that takes the pickers to their goals, m, ``(2, 3)``, or as near as one step of ``reach`` m can."""
+    move = np.clip((goals - pickers(state)) / reach, -1.0, 1.0)
     return np.column_stack([move, np.full(2, 1.0 if pick else -1.0)]).ravel()
 
 

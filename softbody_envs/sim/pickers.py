@@ -52,6 +52,7 @@ class Pickers:
     :param radius: of the spheres, m
     :param grasp_range: farthest node that can be taken, m from the centre
     :param mass: of a picker, kg: a heavy one goes where it is sent whatever it holds
+    :param reach: farthest that a picker moves along each axis in one control step, m
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Pickers:
         radius: float,
         grasp_range: float,
         mass: float = MASS,
+        reach: float = REACH,
     ) -> None:
         self._world = world
         self._target = target
@@ -72,6 +74,7 @@ class Pickers:
         self._sent = self.positions.copy()
         self._low, self._high = np.asarray(low), np.asarray(high)
         self._grasp_range = grasp_range
+        self._reach = reach
         self._interval = max(1, world.steps_per_control // SUBSTEPS)
         # Falling and being lifted again, a picker ends each sub-step at the height it was sent to.
         self._lift = np.array([0.0, 0.0, -GRAVITY * world.time_step * (self._interval + 1) / 2])
@@ -97,7 +100,7 @@ class Pickers:
         commands = action.reshape(len(self._bodies), 4)
         picks = commands[:, 3] > 0.0
         substeps = self._world.steps_per_control // self._interval
-        move = commands[:, :3] * (REACH / substeps)
+        move = commands[:, :3] * (self._reach / substeps)
         for picker, pick in enumerate(picks):
             if not pick:
                 self._release(picker)

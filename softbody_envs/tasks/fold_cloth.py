@@ -22,6 +22,8 @@ PICKER_HEIGHT = 0.10
 PICKER_OFFSET = 0.10
 #: Range of both sides of the cloth, m.
 SIZES = (0.38, 0.54)
+#: Elements of an action that say whether a picker holds.
+PICKS = [3, 7]
 #: Control steps in which the cloth comes to rest before an episode.
 SETTLE_STEPS = 2
 #: Rows of nodes in each half of the cloth; the middle row belongs to neither.
@@ -125,6 +127,8 @@ class FoldClothEnv(SoftbodyEnv):
 
     #: Lowest and highest corner of the box that the centres of the pickers stay in, m.
     workspace: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]] = ((-0.45, -0.45, PICKER_RADIUS), (0.45, 0.45, 0.40))
+    #: Farthest that a picker moves along each axis in one control step, m.
+    picker_reach: ClassVar[float] = REACH
     #: Weight of how far the lower half is from its place against how far apart the halves are.
     fixation_weight: ClassVar[float] = 1.2
     #: How many of x, y, z these distances have.
@@ -144,7 +148,9 @@ class FoldClothEnv(SoftbodyEnv):
         world.add_box_floor()
         self.cloth = Cloth(world, grid)
         low, high = np.array(self.workspace)
-        self.pickers = Pickers(world, self.cloth, np.array(pickers), low, high, PICKER_RADIUS, GRASP_RANGE, mass=PICKER_MASS)
+        self.pickers = Pickers(
+            world, self.cloth, np.array(pickers), low, high, PICKER_RADIUS, GRASP_RANGE, PICKER_MASS, self.picker_reach
+        )
 
     def _control(self, action: np.ndarray) -> None:
         self.pickers.control(action)

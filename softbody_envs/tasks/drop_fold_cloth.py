@@ -69,7 +69,7 @@ class DropFoldClothEnv(FoldClothEnv):
     `performance` is this reward; `normalized_performance` = 1 - performance / initial performance; `is_success` from 0.9
     on; `monotone` is minus the distance between the halves in space, m.
 
-    Holding the cloth still scores 0, and letting go no more on average. A cloth that is dropped in a heap on the best
+    Holding the cloth still scores 0, letting go 0.07 on average (20 scenes). A cloth that is dropped in a heap on the best
     place can reach 0.33, one that is laid out up to a quarter of its length or to the fold while the rest stands there
     0.76 (calculated from ideal poses).
 
@@ -102,8 +102,8 @@ class DropFoldClothEnv(FoldClothEnv):
     * The lower half weighs 7, not 1.2: with less than 7 a cloth whose lower half is laid out would score less than one
       of which a quarter is (with 1.2 -0.37 and 0.43), and a learner would stop there.
     * The pickers reach the floor, and they hold the cloth at the start instead of only being near it.
-    * The lower edge is at the floor at first. Cloth that hangs higher can be carried forward in the air, which scores up
-      to 0.5 and leads nowhere: what is laid down from there does not lie where it belongs.
+    * The lower edge is at the floor at first. Higher up, the first steps of the way to the fold score nothing, and to carry
+      the cloth forward in the air scores 0.33 and leads nowhere.
     * Pickers move 0.03 m in one step, not 0.08 m: random ones, or those of a policy that explores, drag away what is laid.
     * The state also says where the cloth belongs, and how its sides run. Corners and pickers do not tell where a cloth that
       has been moved hung, how much of it is laid, or which way it bulges.

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import obs_as_tensor, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.errors import UserError
-from sb3_por.evaluation import evaluation_episodes, make_evaluation_env
+from sb3_por.evaluation import EnvWrapper, evaluation_episodes, make_evaluation_env
 from sb3_por.loading import find_environment, load_model, trained_in
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.replay import SequenceReplayBuffer
@@ -96,6 +96,7 @@ def diagnose(
     seed: int = 0,
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
+    env_wrapper: EnvWrapper | None = None,
 ) -> Diagnosis:
     """
     Play held-out episodes with a model and at random, and measure its partial-order objective on their frames.
@@ -106,12 +107,13 @@ def diagnose(
     :param seed: of the first episode, the random policy, and the pairs; the global generators are set to it
     :param env_kwargs: for the environment's constructor
     :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
+    :param env_wrapper: what the model was trained inside
     :raises UserError: if the model learns no order, or was not trained on this environment
     """
     objective = check_order(model)
     if n_episodes < 1:
         raise UserError(f"a diagnosis needs at least 1 episode, got {n_episodes}")
-    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize)
+    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize, env_wrapper)
     set_random_seed(seed)
     env.action_space.seed(seed)
     model.policy.set_training_mode(False)

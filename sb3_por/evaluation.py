@@ -19,6 +19,8 @@ from sb3_por.errors import UserError, one_line
 from softbody_envs.registration import ENV_IDS
 from softbody_envs.variations import SPLITS
 
+#: Puts wrappers around an environment.
+EnvWrapper = Callable[[gym.Env], gym.Env]
 #: Seed of the first evaluation episode; the k-th has this plus k.
 EVAL_SEED = 0
 
@@ -196,7 +198,7 @@ def make_evaluation_env(
     env_id: str,
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
-    wrapper: Callable[[gym.Env], gym.Env] | None = None,
+    env_wrapper: EnvWrapper | None = None,
 ) -> VecEnv:
     """
     An environment that gives a model the observations it was trained on.
@@ -205,14 +207,14 @@ def make_evaluation_env(
     :param env_id: a Gymnasium id
     :param env_kwargs: for the environment's constructor; they win over what is read from the model
     :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
-    :param wrapper: put around the bare environment
+    :param env_wrapper: what the model was trained inside; put around the environment, outside of ``Monitor`` as the zoo does
     :raises UserError: if the environment cannot be made, or its spaces are not the model's
     """
     kwargs = _observation_kwargs(env_id, model.observation_space) | evaluation_kwargs(env_id) | (env_kwargs or {})
 
     def make() -> gym.Env:
-        env = gym.make(env_id, **kwargs)
-        return FixedEpisodes(Monitor(wrapper(env) if wrapper is not None else env))
+        env: gym.Env = Monitor(gym.make(env_id, **kwargs))
+        return FixedEpisodes(env if env_wrapper is None else env_wrapper(env))
 
     try:
         env: VecEnv = DummyVecEnv([make])
@@ -240,6 +242,7 @@ def evaluate(
     seed: int = EVAL_SEED,
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
+    env_wrapper: EnvWrapper | None = None,
 ) -> Evaluation:
     """
     Evaluate a model's deterministic policy on held-out variations 800, 801, ...
@@ -250,11 +253,12 @@ def evaluate(
     :param seed: seed of the first episode; the k-th is reset with ``seed + k``
     :param env_kwargs: for the environment's constructor
     :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
+    :param env_wrapper: what the model was trained inside
     :raises UserError: if the environment does not fit the model
     """
     if n_episodes < 1:
         raise UserError(f"an evaluation needs at least 1 episode, got {n_episodes}")
-    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize)
+    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize, env_wrapper)
     try:
         return run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))
     finally:

@@ -8,7 +8,7 @@ import imageio.v2 as imageio
 from gymnasium.wrappers import RenderCollection
 
 from sb3_por.errors import UserError, one_line
-from sb3_por.evaluation import EVAL_SEED, Evaluation, Model, evaluation_episodes, make_evaluation_env, run_episodes
+from sb3_por.evaluation import EVAL_SEED, EnvWrapper, Evaluation, Model, evaluation_episodes, make_evaluation_env, run_episodes
 from sb3_por.files import atomic_write, check_output
 from softbody_envs.registration import ENV_IDS
 
@@ -31,6 +31,7 @@ def film(
     size: int = 480,
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
+    env_wrapper: EnvWrapper | None = None,
 ) -> Evaluation:
     """
     Film a model's deterministic policy on the first held-out episodes.
@@ -43,6 +44,7 @@ def film(
     :param size: height and width in pixels, for environments that let it be chosen
     :param env_kwargs: for the environment's constructor
     :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
+    :param env_wrapper: what the model was trained inside
     :return: how the model did
     :raises UserError: if the environment does not fit the model or draws no images
     """
@@ -53,7 +55,11 @@ def film(
         raise UserError(f"a film needs at least 1 pixel, got the size {size}")
     drawn: dict[str, Any] = {"render_mode": "rgb_array"} | ({"render_size": size} if env_id in ENV_IDS else {})
     kwargs = (env_kwargs or {}) | drawn
-    env = make_evaluation_env(model, env_id, kwargs, vec_normalize, lambda inner: RenderCollection(inner, reset_clean=False))
+
+    def filmed(env: gym.Env) -> gym.Env:
+        return RenderCollection(env if env_wrapper is None else env_wrapper(env), reset_clean=False)
+
+    env = make_evaluation_env(model, env_id, kwargs, vec_normalize, filmed)
     try:
         fps = env.get_attr("metadata")[0].get("render_fps", 30)
         evaluation = run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))

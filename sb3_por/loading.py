@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_por import ALGORITHMS
 from sb3_por.errors import UserError, check_known, one_line
-from sb3_por.evaluation import whole_episodes
+from sb3_por.evaluation import EnvWrapper, whole_episodes
 from sb3_por.runs import BEST_STATISTICS, read_settings, run_arguments, the_run
 
 #: name -> class of every algorithm whose models can be loaded; a DDPG model is a TD3 model with other settings
@@ -85,17 +85,33 @@ def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
 
     :param path: as :func:`load_model` takes it
     :param env_id: the environment
-    :return: the arguments ``env_kwargs`` and ``vec_normalize`` of :func:`sb3_por.evaluation.evaluate` and its likes
+    :return: the arguments ``env_kwargs``, ``vec_normalize`` and ``env_wrapper`` of :func:`sb3_por.evaluation.evaluate` and its
+        likes
+    :raises UserError: if a wrapper in its settings cannot be imported
     """
     file = model_file(path)
     folder = file.parent / env_id
-    env_kwargs = read_settings(folder / "config.yml").get("env_kwargs")
+    settings = read_settings(folder / "config.yml")
+    env_kwargs = settings.get("env_kwargs")
     of_best = folder / BEST_STATISTICS
     statistics = of_best if file.name == "best_model.zip" and of_best.is_file() else folder / "vecnormalize.pkl"
     return {
         "env_kwargs": whole_episodes(env_kwargs) if isinstance(env_kwargs, dict) else {},
         "vec_normalize": str(statistics) if statistics.is_file() else None,
+        "env_wrapper": _env_wrapper(settings),
     }
+
+
+def _env_wrapper(settings: dict[str, Any]) -> EnvWrapper | None:
+    """The wrappers that a run's settings name."""
+    if not settings.get("env_wrapper"):
+        return None
+    from rl_zoo3.utils import get_wrapper_class  # takes seconds to import
+
+    try:
+        return get_wrapper_class(settings)
+    except (AssertionError, AttributeError, ImportError, ValueError) as error:
+        raise UserError(f"cannot import the env_wrapper {settings['env_wrapper']}: {one_line(error)}") from error
 
 
 def import_packages(names: Iterable[str]) -> None:

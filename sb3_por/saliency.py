@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from sb3_por.diagnostics import check_order
 from sb3_por.errors import UserError
-from sb3_por.evaluation import evaluation_episodes, make_evaluation_env
+from sb3_por.evaluation import EnvWrapper, evaluation_episodes, make_evaluation_env
 from sb3_por.files import atomic_write, check_output
 
 FORMATS = (".png", ".jpg")
@@ -70,6 +70,7 @@ def draw_saliency(
     seed: int = 0,
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
+    env_wrapper: EnvWrapper | None = None,
 ) -> int:
     """
     Play the first held-out episode, and draw what the classifier looks at in one of its frames.
@@ -81,6 +82,7 @@ def draw_saliency(
     :param seed: of the episode
     :param env_kwargs: for the environment's constructor
     :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
+    :param env_wrapper: what the model was trained inside
     :return: the step that was drawn
     :raises UserError: if the model learns no order from images, or there is no such step
     """
@@ -88,7 +90,7 @@ def draw_saliency(
     path = check_output(path, FORMATS)
     if not isinstance(model.observation_space, spaces.Box) or len(model.observation_space.shape) != 3:
         raise UserError(f"a saliency map needs a model that sees images alone, not {model.observation_space}")
-    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize)
+    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize, env_wrapper)
     try:
         env.env_method("play", evaluation_episodes(env_id, 1, seed))
         observation: Any = env.reset()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from rl_zoo3.wrappers import TimeFeatureWrapper
 from sb3_contrib import TQC
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
@@ -110,7 +111,7 @@ def test_stacked_frames_and_normalised_observations_are_restored(tmp_path):
     plain = evaluate(model, "Pendulum-v1", n_episodes=1)
     normalised = evaluate(model, "Pendulum-v1", n_episodes=1, **environment)
     assert plain.returns != normalised.returns
-    assert trained_in(tmp_path, "PourWater-v0") == {"env_kwargs": {}, "vec_normalize": None}
+    assert trained_in(tmp_path, "PourWater-v0") == {"env_kwargs": {}, "vec_normalize": None, "env_wrapper": None}
 
 
 def test_a_run_is_evaluated_in_the_environment_that_it_was_trained_in_but_on_whole_episodes(tmp_path):
@@ -119,10 +120,29 @@ def test_a_run_is_evaluated_in_the_environment_that_it_was_trained_in_but_on_who
     (tmp_path / "Pendulum-v1").mkdir()
     (tmp_path / "Pendulum-v1" / "config.yml").write_text("env_kwargs: {g: 1.0, max_episode_steps: 7}\n")
     environment = trained_in(tmp_path, "Pendulum-v1")
-    assert environment == {"env_kwargs": {"g": 1.0}, "vec_normalize": None}
+    assert environment == {"env_kwargs": {"g": 1.0}, "vec_normalize": None, "env_wrapper": None}
     light = evaluate(model, "Pendulum-v1", n_episodes=1, **environment)
     assert light.lengths == [200]
     assert light.returns != evaluate(model, "Pendulum-v1", n_episodes=1).returns
+
+
+def test_a_run_is_evaluated_inside_the_wrappers_that_it_was_trained_in(tmp_path):
+    clipped = "gymnasium.wrappers.ClipReward: {min_reward: -2000000.0, max_reward: -1000000.0}"
+    wrappers = f"env_wrapper:\n- rl_zoo3.wrappers.TimeFeatureWrapper\n- {clipped}\n"
+    (tmp_path / "FallingBall-v0").mkdir()
+    (tmp_path / "FallingBall-v0" / "config.yml").write_text(wrappers)
+    model = SAC("MlpPolicy", TimeFeatureWrapper(gym.make("FallingBall-v0", obs_type="state")), buffer_size=10, seed=0)
+    model.save(tmp_path / "best_model.zip")
+    environment = trained_in(tmp_path, "FallingBall-v0")
+    evaluation = evaluate(model, "FallingBall-v0", n_episodes=1, **environment)
+    assert evaluation.returns[0] > -1e4  # the environment's own rewards, as in training
+    filmed = film(model, "FallingBall-v0", tmp_path / "film.gif", size=32, **environment)
+    assert filmed.returns == evaluation.returns
+    with pytest.raises(UserError, match="was not trained on FallingBall-v0"):
+        evaluate(model, "FallingBall-v0", n_episodes=1)
+    (tmp_path / "FallingBall-v0" / "config.yml").write_text("env_wrapper: no_such_package.Wrapper\n")
+    with pytest.raises(UserError, match="cannot import the env_wrapper no_such_package"):
+        trained_in(tmp_path, "FallingBall-v0")
 
 
 def test_expert_is_the_ceiling_and_random_the_floor():

@@ -42,6 +42,7 @@ class VisualActorCritic(Algorithm):
     :param actor_update_interval: Update actor and temperature every that many updates
     :param target_update_interval: Update the target networks every that many updates (SB3 counts within one call of
         ``train()``, SB3 #2158)
+    :param ent_coef_lr_ratio: Learning rate of the temperature, in units of ``learning_rate``
     :param reward_scale: Factor on the rewards in the critic's target
     :param augmentation_pad: Random shift of images, in pixels; 0 for none
     :param n_augmentations: DrQ's M: augmentations of o_t whose critic losses are averaged
@@ -88,6 +89,7 @@ class VisualActorCritic(Algorithm):
         encoder_tau: float | None = None,
         actor_update_interval: int = 1,
         target_update_interval: int = 1,
+        ent_coef_lr_ratio: float = 1.0,
         reward_scale: float = 1.0,
         augmentation_pad: int = 4,
         n_augmentations: int = 1,
@@ -103,6 +105,7 @@ class VisualActorCritic(Algorithm):
         self.compile_mode = compile_mode
         self.encoder_tau = encoder_tau
         self.actor_update_interval = actor_update_interval
+        self.ent_coef_lr_ratio = ent_coef_lr_ratio
         self.reward_scale = reward_scale
         self.augmentation_pad = augmentation_pad
         self.n_augmentations = n_augmentations
@@ -213,13 +216,12 @@ class VisualActorCritic(Algorithm):
             return
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
-        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        learning_rate = self.lr_schedule(self._current_progress_remaining)
         if self.ent_coef_optimizer is not None:
-            optimizers.append(self.ent_coef_optimizer)
-        self._update_learning_rate(optimizers)
+            update_learning_rate(self.ent_coef_optimizer, self.ent_coef_lr_ratio * learning_rate)
         if self.policy.objective_optimizer is not None:
-            aux_learning_rate = self.aux_lr_ratio * self.lr_schedule(self._current_progress_remaining)
-            update_learning_rate(self.policy.objective_optimizer, aux_learning_rate)
+            update_learning_rate(self.policy.objective_optimizer, self.aux_lr_ratio * learning_rate)
 
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -334,6 +336,7 @@ class VisualActorCritic(Algorithm):
         actor_loss.backward(inputs=[p for group in self.actor.optimizer.param_groups for p in group["params"]])
         self.actor.optimizer.step()
         self._metrics.add("actor_loss", actor_loss)
+        self._metrics.add("entropy", -log_prob.mean())
 
         if self.ent_coef_optimizer is not None:
             ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()

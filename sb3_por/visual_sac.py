@@ -49,6 +49,8 @@ class VisualSAC(VisualActorCritic, SAC):
         once for this class, 5 times (at most 1) where an objective learns from the momentum encoder
     :param actor_update_interval: Update actor and temperature every that many updates
     :param target_update_interval: Update the target networks every that many updates, counted over the whole training
+    :param ent_coef_lr_ratio: Learning rate of the temperature, in units of ``learning_rate``. The larger rewards are, the
+        farther the temperature has to go; where it comes too late, the policy's entropy falls below its target
     :param reward_scale: Factor on the rewards in the critic's target
     :param augmentation_pad: Largest random shift of images in pixels; 0 for none
     :param n_augmentations: Augmentations of each observation, whose critic losses are averaged (DrQ's M)

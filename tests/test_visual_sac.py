@@ -104,6 +104,16 @@ def test_intervals_count_over_the_whole_training():
     assert changed == [(False, False), (False, True), (True, False), (False, True), (False, False), (True, True)]
 
 
+@pytest.mark.parametrize("ratio", [1.0, 10.0])
+def test_temperature_has_a_learning_rate_of_its_own(ratio):
+    model = make_model(ent_coef="auto_0.1", learning_rate=1e-3, ent_coef_lr_ratio=ratio)
+    before = model.log_ent_coef.item()
+    model.train(1, 8)
+    # Adam's first step is as long as its learning rate
+    assert abs(model.log_ent_coef.item() - before) == pytest.approx(1e-3 * ratio, rel=1e-2)
+    assert {group["lr"] for group in model.actor.optimizer.param_groups} == {1e-3}
+
+
 def count_encodings(model):
     """Rows that pass each trunk in one update."""
     rows = {}
@@ -164,7 +174,7 @@ def test_logs_objective_control_and_gradient_norms():
     model.train(2, 8)
     logged = model.logger.name_to_value
     expected = {"por_loss", "por_accuracy", "por_leak_loss", "por_leak_accuracy", "critic_loss", "actor_loss", "ent_coef"}
-    expected |= {"ent_coef_loss", "n_updates", "encoder_grad_norm_critic", "encoder_grad_norm_por"}
+    expected |= {"ent_coef_loss", "entropy", "n_updates", "encoder_grad_norm_critic", "encoder_grad_norm_por"}
     assert {f"train/{name}" for name in expected} <= set(logged)
     assert all(math.isfinite(logged[f"train/{name}"]) for name in expected)
     assert logged["train/encoder_grad_norm_por"] > 0

@@ -75,6 +75,23 @@ def comparison() -> str:
     return markdown(head, rows)
 
 
+def weights() -> str:
+    """POR by pairing and weight: each seed on the way, and at the end of `main`."""
+    scores = pd.concat(read_scores([RESULTS / suite / "scores.csv"]) for suite in ("main", "weights"))
+    runs = scores.sort_values("seed").groupby(["algo", "step"])[METRIC]
+    rows = []
+    for algo, pairing, weight in (
+        ("por_lambda_0", "-", 0),
+        ("por_10", "swap", 10),
+        ("sac_por", "swap", 100),
+        ("por_paper_10", "paper", 10),
+        ("por_paper", "paper", 100),
+    ):
+        columns = (", ".join(f"{score:.2f}" for score in runs.get_group((algo, step))) for step in (7500, 12500))
+        rows.append((f"`{algo}`", pairing, str(weight), *columns, f"{runs.get_group((algo, 12500)).mean():.2f}"))
+    return markdown(("", "pairing", "λ", "after 7500 steps", "after 12 500", "mean"), rows)
+
+
 def courses(suite: str) -> str:
     """A few runs, each by itself: where it was best, and where it ended."""
     scores = read_scores([RESULTS / suite / "scores.csv"])
@@ -178,6 +195,7 @@ def leak() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "comparison": comparison,
+    "weights": weights,
     "longer": lambda: courses("long"),
     "steady": lambda: courses("steady"),
     "trials": trials,
@@ -199,7 +217,7 @@ def fill_in(page: str) -> str:
 
 def draw() -> None:
     """The figures of scores and of order."""
-    for suite in ("main", "long", "steady", "state"):
+    for suite in ("main", "weights", "long", "steady", "state"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     plot_order(read_order([RESULTS / "main" / "order.csv"]))[0].save(RESULTS / "main" / "order.png")

@@ -1,0 +1,59 @@
+"""What settings may wrap around a task."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from softbody_envs.wrappers import ActionRepeat
+
+ID = "PourWater-v0"
+
+
+def play(env, action, steps):
+    env.reset(options={"variation": 3})
+    return [env.step(np.full(env.action_space.shape, action, dtype=np.float32)) for _ in range(steps)]
+
+
+@pytest.mark.parametrize("env_id", [ID, "StraightenRope-v0"])
+def test_an_action_is_repeated_and_its_rewards_add_up(env_id):
+    every = play(gym.make(env_id, obs_type="state"), 0.25, 45)
+    fifth = play(ActionRepeat(gym.make(env_id, obs_type="state"), repeat=5, scale=0.5), 0.5, 9)
+    assert all(np.array_equal(few[0], many[0]) for few, many in zip(fifth, every[4::5], strict=True))
+    assert [few[4] for few in fifth] == [many[4] for many in every[4::5]]
+    sums = np.array([many[1] for many in every]).reshape(9, 5).sum(axis=1)
+    assert [few[1] for few in fifth] == pytest.approx(sums)
+    assert sums.any() == (env_id != ID)  # no water flows at this tilt
+
+
+def test_actions_out_of_range_are_clipped_before_they_are_made_smaller():
+    half = play(gym.make(ID, obs_type="state"), 0.5, 1)
+    beyond = play(ActionRepeat(gym.make(ID, obs_type="state"), repeat=1, scale=0.5), 7.0, 1)
+    assert np.array_equal(half[0][0], beyond[0][0])
+
+
+def test_the_end_of_an_episode_ends_the_repetition():
+    env = ActionRepeat(gym.make(ID, obs_type="state", max_episode_steps=7), repeat=5)
+    first, last = play(env, 0.0, 2)
+    assert not first[3] and last[3]
+
+
+def test_wrong_actions_are_refused_as_without_it():
+    env = ActionRepeat(gym.make(ID, obs_type="state"), repeat=5, scale=0.5)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="nan"):
+        env.step(np.array([np.nan, 0.0, 0.0], dtype=np.float32))
+
+
+@pytest.mark.parametrize("arguments", [dict(repeat=0), dict(repeat=1.5), dict(repeat=2, scale=0.0), dict(repeat=2, scale=2.0)])
+def test_wrong_arguments_are_refused(arguments):
+    with pytest.raises(ValueError, match=list(arguments)[-1]):
+        ActionRepeat(gym.make(ID, obs_type="state"), **arguments)
+
+
+@pytest.mark.filterwarnings("ignore:.*is different from the unwrapped")
+def test_it_is_a_gymnasium_environment_with_a_spec():
+    env = ActionRepeat(gym.make(ID, obs_type="state"), repeat=5, scale=0.5)
+    check_env(env, skip_render_check=True)
+    again = gym.make(env.spec)
+    assert isinstance(again, ActionRepeat) and (again.repeat, again.scale) == (5, 0.5)

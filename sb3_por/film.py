@@ -57,7 +57,8 @@ def film(
     kwargs = (env_kwargs or {}) | drawn
 
     def filmed(env: gym.Env) -> gym.Env:
-        return RenderCollection(env if env_wrapper is None else env_wrapper(env), reset_clean=False)
+        recorded: gym.Env = RenderCollection(env, reset_clean=False)  # innermost: sees every step of an ActionRepeat
+        return recorded if env_wrapper is None else env_wrapper(recorded)
 
     env = make_evaluation_env(model, env_id, kwargs, vec_normalize, filmed)
     try:

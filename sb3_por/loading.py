@@ -79,6 +79,15 @@ def model_file(path: str | Path) -> Path:
     return path
 
 
+def settings_of(path: str | Path, env_id: str) -> Path:
+    """
+    :param path: as :func:`load_model` takes it
+    :param env_id: the environment
+    :return: where the settings of the model's run are, if it has any
+    """
+    return model_file(path).parent / env_id / "config.yml"
+
+
 def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
     """
     The environment that a run's model was trained in, as far as its folder says.
@@ -91,7 +100,7 @@ def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
     """
     file = model_file(path)
     folder = file.parent / env_id
-    settings = read_settings(folder / "config.yml")
+    settings = read_settings(settings_of(path, env_id))
     env_kwargs = settings.get("env_kwargs")
     of_best = folder / BEST_STATISTICS
     statistics = of_best if file.name == "best_model.zip" and of_best.is_file() else folder / "vecnormalize.pkl"

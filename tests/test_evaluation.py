@@ -20,6 +20,7 @@ from sb3_por.evaluation import Episode, Evaluation, FixedEpisodes, evaluate, eva
 from sb3_por.film import film, write_film
 from sb3_por.loading import load_model, trained_in
 from sb3_por.reference import ExpertModel, RandomModel
+from softbody_envs.wrappers import ActionRepeat
 
 EPISODE_STEPS = 7
 
@@ -238,6 +239,14 @@ def test_a_film_has_a_frame_for_the_reset_and_each_step(suffix, tmp_path):
     assert 20 < len(frames) <= 101 and frames[0].shape[:2] == (64, 64)
     assert evaluation.lengths == [100]
     assert not np.array_equal(frames[0][..., :3], frames[-1][..., :3])
+
+
+def test_a_film_shows_the_steps_that_a_wrapper_makes_of_one(tmp_path):
+    path = tmp_path / "film.mp4"
+    filmed = film(
+        ExpertModel("PourWater-v0"), "PourWater-v0", path, size=64, env_wrapper=lambda env: ActionRepeat(env, repeat=10)
+    )
+    assert len(imageio.mimread(path, memtest=False)) == 101 and filmed.lengths == [100]
 
 
 def test_films_of_odd_size_and_unknown_format(tmp_path):

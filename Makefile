@@ -1,4 +1,4 @@
-# make train   set up and train POR on pouring: make train ARGS="-n 20000 --seed 1"
+# make train   set up and train POR on pouring: make train ARGS="-n 2500 --seed 1"
 # make test    set up and run the tests:        make test ARGS="-k plots"
 # make demo    a small run from training to a curve and a GIF, within 10 minutes on two CPU cores
 # make lint, make format, make type, make bench
@@ -26,8 +26,8 @@ DEMO := demo/$(shell date +%Y%m%d-%H%M%S)
 DEMO_RUN := $(DEMO)/sac_por/PourWater-v0_1
 
 demo: $(VENV)/.installed-test
-	$(BIN)/python train.py --algo sac_por --env PourWater-v0 --seed 1 -n 3000 --eval-freq 1000 --eval-episodes 5 \
-		-f $(DEMO) -params learning_starts:500 buffer_size:3000 $(ARGS)
+	$(BIN)/python train.py --algo sac_por --env PourWater-v0 --seed 1 -n 1200 --eval-freq 400 --eval-episodes 5 \
+		-f $(DEMO) -params learning_starts:600 buffer_size:3000 $(ARGS)
 	$(BIN)/python -m sb3_por evaluate --model $(DEMO_RUN)/best_model.zip --env PourWater-v0 -n 10
 	$(BIN)/python -m sb3_por plot $(DEMO_RUN) -o $(DEMO)/curve.png
 	$(BIN)/python -m sb3_por enjoy --model $(DEMO_RUN)/best_model.zip --env PourWater-v0 -o $(DEMO)/pour_water.gif

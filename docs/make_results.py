@@ -1,5 +1,5 @@
 """
-Fills in the tables of results.md and por.md from the tables in results/, and draws their figures.
+Fills in the tables of results.md, full_speed.md and por.md from the tables in results/, and draws their figures.
 
     python docs/make_results.py              tables only
     python docs/make_results.py --figures    and the figures
@@ -20,7 +20,7 @@ from sb3_por.scores import read_scores
 
 DOCS = Path(__file__).parent
 RESULTS = DOCS.parent / "results"
-PAGES = ("results.md", "por.md")
+PAGES = ("results.md", "full_speed.md", "por.md")
 METRIC = "normalized_performance"
 #: Task -> mean score that SAC is to reach from the state, and within how many steps.
 WANTED = {
@@ -46,9 +46,9 @@ def with_interval(value: float, low: float, high: float) -> str:
     return f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def comparison() -> str:
+def comparison(suite: str) -> str:
     """Every method on pouring: score, ratio to the best rival, whether POR is better, time."""
-    scores = read_scores([RESULTS / "main" / "scores.csv"])
+    scores = read_scores([RESULTS / suite / "scores.csv"])
     tables = {kind: plot(scores, kind)[0].table for kind in ("aggregates", "ratio", "improvement")}
     means = tables["aggregates"].query("statistic == 'mean'").set_index("algo").sort_values("value", ascending=False)
     ratios = tables["ratio"].set_index("algo")
@@ -76,8 +76,8 @@ def comparison() -> str:
 
 
 def weights() -> str:
-    """POR by pairing and weight: each seed on the way, and at the end of `main`."""
-    scores = pd.concat(read_scores([RESULTS / suite / "scores.csv"]) for suite in ("main", "weights"))
+    """POR by pairing and weight: each seed on the way, and at the end of `full_speed`."""
+    scores = pd.concat(read_scores([RESULTS / suite / "scores.csv"]) for suite in ("full_speed", "weights"))
     runs = scores.sort_values("seed").groupby(["algo", "step"])[METRIC]
     rows = []
     for algo, pairing, weight in (
@@ -118,7 +118,7 @@ def trials() -> str:
     for (env_id, name, seed), run in scores.groupby(["env", "algo", "seed"]):
         run = run.sort_values("step")
         course = ", ".join(f"{score:.2f}" for score in run[METRIC])
-        rows.append((f"`{env_id}`", f"`{name}`", str(seed), f"{run['step'].iloc[0] / 1000:.0f}k", course))
+        rows.append((f"`{env_id}`", f"`{name}`", str(seed), f"{run['step'].iloc[0] / 1000:g}k", course))
     return markdown(("", "label", "seed", "every", "evaluations"), rows)
 
 
@@ -143,9 +143,9 @@ def state() -> str:
     return markdown(("", "wanted", "best evaluation", "at step", "stopped at", "minutes to the best"), rows)
 
 
-def diagnosis() -> str:
+def diagnosis(suite: str) -> str:
     """What the classifiers of the comparison have learned."""
-    table = pd.read_csv(RESULTS / "main" / "diagnosis.csv")
+    table = pd.read_csv(RESULTS / suite / "diagnosis.csv")
     rows = [
         (
             f"`{row.algo}`",
@@ -194,13 +194,15 @@ def leak() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "comparison": comparison,
+    "comparison": lambda: comparison("main"),
+    "full_speed": lambda: comparison("full_speed"),
     "weights": weights,
     "longer": lambda: courses("long"),
     "steady": lambda: courses("steady"),
     "trials": trials,
     "state": state,
-    "diagnosis": diagnosis,
+    "diagnosis": lambda: diagnosis("main"),
+    "diagnosis_full_speed": lambda: diagnosis("full_speed"),
     "leak": leak,
 }
 
@@ -217,10 +219,11 @@ def fill_in(page: str) -> str:
 
 def draw() -> None:
     """The figures of scores and of order."""
-    for suite in ("main", "weights", "long", "steady", "state"):
+    for suite in ("main", "full_speed", "weights", "long", "steady", "state"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
-    plot_order(read_order([RESULTS / "main" / "order.csv"]))[0].save(RESULTS / "main" / "order.png")
+    for suite in ("main", "full_speed"):
+        plot_order(read_order([RESULTS / suite / "order.csv"]))[0].save(RESULTS / suite / "order.png")
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ def common(trial: optuna.Trial) -> dict[str, Any]:
     """
     return {
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 2e-3, log=True),
-        "gamma": trial.suggest_categorical("gamma", [0.95, 0.97, 0.98, 0.99]),
+        "gamma": trial.suggest_categorical("gamma", [0.9, 0.95, 0.97, 0.99]),
         "tau": trial.suggest_float("tau", 0.005, 0.05, log=True),
         "encoder_tau": trial.suggest_float("encoder_tau", 0.01, 0.1, log=True),
     }
@@ -27,7 +27,7 @@ def partial_order(trial: optuna.Trial) -> dict[str, Any]:
     :return: lambda, m (of 50 features), k, pairing and head of the partial-order objective
     """
     return {
-        # Beside the critic's loss, which grows with the square of ``reward_scale``: 400 times in our settings
+        # Beside the critic's loss, which grows with the square of what a step can earn: 400 times in our settings
         "por_coef": trial.suggest_float("por_coef", 0.1, 1000.0, log=True),
         "order_dim": trial.suggest_categorical("order_dim", [1, 5, 10, 25, 40]),
         "k": trial.suggest_int("k", 1, 5),

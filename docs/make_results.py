@@ -22,6 +22,8 @@ DOCS = Path(__file__).parent
 RESULTS = DOCS.parent / "results"
 PAGES = ("results.md", "full_speed.md", "por.md")
 METRIC = "normalized_performance"
+#: Whom the paper compares POR with, from pixels.
+RIVALS = ("sac_drq", "sac_curl", "sac_spr")
 #: Task -> mean score that SAC is to reach from the state, and within how many steps.
 WANTED = {
     "PourWater-v0": (0.8, 100_000),
@@ -73,6 +75,17 @@ def comparison(suite: str) -> str:
         )
     head = ("", "mean", "each seed", "ratio to its best rival", "`sac_por` is better with probability", "minutes")
     return markdown(head, rows)
+
+
+def rivals() -> str:
+    """The plain learner and POR beside those that the paper compares with."""
+    scores = read_scores([RESULTS / "main" / "scores.csv"])
+    rows = []
+    for algo in ("sac_por", "por_lambda_0"):
+        ratios = plot(scores[scores["algo"].isin([algo, *RIVALS])], "ratio")[0].table.set_index("algo")
+        row = ratios.loc[algo]
+        rows.append((f"`{algo}`", f"`{row['rival']}`", with_interval(*row[["ratio", "low", "high"]])))
+    return markdown(("", "best of the three", "ratio"), rows)
 
 
 def weights() -> str:
@@ -195,6 +208,7 @@ def leak() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "comparison": lambda: comparison("main"),
+    "rivals": rivals,
     "full_speed": lambda: comparison("full_speed"),
     "weights": weights,
     "longer": lambda: courses("long"),

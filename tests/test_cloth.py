@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from softbody_envs.experts import make_expert
+from softbody_envs.experts import fold_cloth, make_expert
 from softbody_envs.sim import cloth
 from softbody_envs.sim.cloth import N_SIDE, TETHER
 from softbody_envs.tasks.fold_cloth import GRASP_RANGE, N_HALF, PICKER_RADIUS
@@ -198,6 +198,20 @@ def test_with_keep_hold_nothing_drops_the_cloth():
     assert state[18:20].tolist() == [1, 1]
     assert (state == holding.state()).all()
     assert action[3] == action[7] == -1.0
+
+
+def test_with_keep_hold_the_flat_cloth_can_be_folded_too(monkeypatch):
+    # Taken as soon as it is in range, not from where the script would take it
+    monkeypatch.setattr(fold_cloth, "GRASP_HEIGHT", 0.058)
+    env = pickle.loads(pickle.dumps(make(keep_hold=True)))
+    state, _ = env.reset(options={"variation": 0})
+    expert = make_expert("FoldCloth-v0")
+    for _ in range(100):
+        action = expert.act(state)
+        action[[3, 7]] = -1.0
+        state, _, _, _, info = env.step(action)
+    assert state[18:20].tolist() == [1, 1]
+    assert info["normalized_performance"] > 0.8
 
 
 def test_first_action_decides_whether_the_hanging_cloth_drops():

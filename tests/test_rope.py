@@ -203,6 +203,21 @@ def test_state_holds_the_key_nodes_the_pickers_and_what_they_hold(env):
         np.testing.assert_allclose(reaches * 0.08, ends - env.pickers.positions[picker], atol=1e-6)
 
 
+def test_with_keep_hold_the_pickers_take_the_rope_and_never_let_go():
+    env = gym.make("StraightenRope-v0", obs_type="state", keep_hold=True).unwrapped
+    env.reset(options={"variation": 0})
+    assert env.pickers.held == [None, None]
+    expert = make_expert("StraightenRope-v0")
+    for _ in range(20):
+        env.step(expert.act(env.state()) * [1, 1, 1, 0, 1, 1, 1, 0])
+    held = list(env.pickers.held)
+    assert None not in held
+    for x in (1.0, -1.0):
+        for _ in range(3):
+            env.step(np.array([x, 0.0, 0.2, -1.0, -x, 0.0, 0.2, -1.0]))
+    assert env.pickers.held == held
+
+
 def test_rope_parts_do_not_pass_through_each_other(env):
     closest = np.inf
     state, _ = env.reset(options={"variation": 810})

@@ -1,15 +1,14 @@
 """DropFoldCloth: lay a hanging cloth on the floor, folded in half."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from gymnasium.utils import EzPickle
 
 from softbody_envs.rendering import Camera
 from softbody_envs.sim.cloth import N_SIDE, flat_grid
 from softbody_envs.sim.pickers import REACH
 from softbody_envs.sim.world import World
-from softbody_envs.tasks.fold_cloth import N_HALF, PICKER_RADIUS, PICKS, SIZES, FoldClothEnv
+from softbody_envs.tasks.fold_cloth import N_HALF, PICKER_RADIUS, SIZES, FoldClothEnv
 
 #: The pickers hold the two upper corners from this far above, m.
 GRIP_HEIGHT = 0.05
@@ -129,11 +128,6 @@ class DropFoldClothEnv(FoldClothEnv):
     fixation_weight: ClassVar[float] = 7.0
     measured_axes: ClassVar[int] = 2
 
-    def __init__(self, *args: Any, keep_hold: bool = False, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        EzPickle.__init__(self, *args, keep_hold=keep_hold, **kwargs)
-        self.keep_hold = keep_hold
-
     def _build(self, world: World, rng: np.random.Generator) -> None:
         length, width = rng.uniform(*SIZES, 2)
         yaw = rng.uniform(-YAW, YAW)
@@ -149,12 +143,6 @@ class DropFoldClothEnv(FoldClothEnv):
             self.cloth.calm()
         self._locate()
         self._place = flat[: -N_HALF - 1 : -1]
-
-    def _control(self, action: np.ndarray) -> None:
-        if self.keep_hold:
-            action = action.copy()
-            action[PICKS] = 1.0
-        super()._control(action)
 
     def _measure(self) -> np.ndarray:
         sides = self._grid[:: (N_SIDE - 1) // (N_POINTS - 1), [0, -1]] - self._place[0, [0, -1]]

@@ -4,12 +4,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from softbody_envs.env import SoftbodyEnv
 from softbody_envs.painting import paint_sheet
 from softbody_envs.rendering import Camera
 from softbody_envs.sim.cloth import N_SIDE, STEPS_PER_CONTROL, Cloth, flat_grid
 from softbody_envs.sim.pickers import REACH, Pickers
 from softbody_envs.sim.world import World
+from softbody_envs.tasks.picker_env import PickerEnv
 
 #: Radius of the pickers, m, and how far from their centres a node may be to be taken: radius, threshold and radius of a
 #: particle of SoftGym's.
@@ -22,8 +22,6 @@ PICKER_HEIGHT = 0.10
 PICKER_OFFSET = 0.10
 #: Range of both sides of the cloth, m.
 SIZES = (0.38, 0.54)
-#: Elements of an action that say whether a picker holds.
-PICKS = [3, 7]
 #: Control steps in which the cloth comes to rest before an episode.
 SETTLE_STEPS = 2
 #: Rows of nodes in each half of the cloth; the middle row belongs to neither.
@@ -32,7 +30,7 @@ FACE = (0.86, 0.27, 0.55)
 UNDERSIDE = (0.98, 0.80, 0.30)
 
 
-class FoldClothEnv(SoftbodyEnv):
+class FoldClothEnv(PickerEnv):
     """
     ## Description
 
@@ -54,7 +52,8 @@ class FoldClothEnv(SoftbodyEnv):
     | 7 | pick | as 3 |
 
     The centres of the pickers stay within x, y = -0.45 to 0.45 m and z = 0.05 to 0.4 m. Two pickers that hold the cloth
-    cannot be sent further apart than 1.1 times the distance of what they hold in the flat cloth.
+    cannot be sent further apart than 1.1 times the distance of what they hold in the flat cloth. With `keep_hold=True` both
+    hold all the time, whatever elements 3 and 7 say.
 
     ## Observation Space
 
@@ -93,7 +92,10 @@ class FoldClothEnv(SoftbodyEnv):
 
     ## Arguments
 
-    See `SoftbodyEnv`.
+    See `SoftbodyEnv`, and
+
+    * `keep_hold` (default `False`): the pickers take the cloth when they come near it and never let go; what is left to
+      decide is where they go. The cloth can be folded so.
 
     ## Differences from SoftGym
 
@@ -112,7 +114,6 @@ class FoldClothEnv(SoftbodyEnv):
     """
 
     camera: ClassVar[Camera] = Camera(position=(0.0, -0.92, 0.95), target=(0.0, 0.0, 0.03))
-    action_size: ClassVar[int] = 8
     state_names: ClassVar[tuple[str, ...]] = (
         *(f"corner {corner} {axis}" for corner in range(4) for axis in "xyz"),
         *(f"picker {picker} {axis}" for picker in range(2) for axis in "xyz"),
@@ -140,7 +141,8 @@ class FoldClothEnv(SoftbodyEnv):
         x, y, _ = (grid[0, 0] + grid[0, -1]) / 2
         self._furnish(world, grid, [(x, y - PICKER_OFFSET, PICKER_HEIGHT), (x, y + PICKER_OFFSET, PICKER_HEIGHT)])
         for _ in range(SETTLE_STEPS):
-            self._control(np.zeros(self.action_size))
+            self.pickers.control(np.zeros(self.action_size))
+        self._locate()
         self._place = self._kept()
 
     def _furnish(self, world: World, grid: np.ndarray, pickers: list[tuple[float, float, float]]) -> None:
@@ -152,12 +154,7 @@ class FoldClothEnv(SoftbodyEnv):
             world, self.cloth, np.array(pickers), low, high, PICKER_RADIUS, GRASP_RANGE, PICKER_MASS, self.picker_reach
         )
 
-    def _control(self, action: np.ndarray) -> None:
-        self.pickers.control(action)
-        self._locate()
-
     def _locate(self) -> None:
-        """Find out where the cloth is; between control steps nothing moves."""
         self._grid = self.cloth.grid()
 
     def _carried(self) -> np.ndarray:

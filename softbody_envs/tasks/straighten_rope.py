@@ -4,12 +4,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from softbody_envs.env import SoftbodyEnv
 from softbody_envs.rendering import Camera
 from softbody_envs.sim.pickers import REACH, Pickers
 from softbody_envs.sim.rope import LENGTH, STEPS_PER_CONTROL, Rope, end_distance, failure
 from softbody_envs.sim.rope_bank import crumpled
 from softbody_envs.sim.world import World
+from softbody_envs.tasks.picker_env import PickerEnv
 
 PICKER_RADIUS = 0.02
 #: SoftGym: picker radius 0.02 + particle radius 0.025 + threshold 0.005.
@@ -22,7 +22,7 @@ HIGH = np.array([0.28, 0.28, 0.20])
 KEY_NODES = (0, 2, 4, 6, 8, 10, 12, 14, 16, 20)
 
 
-class StraightenRopeEnv(SoftbodyEnv):
+class StraightenRopeEnv(PickerEnv):
     """
     ## Description
 
@@ -46,7 +46,7 @@ class StraightenRopeEnv(SoftbodyEnv):
     x points right in the image, y up, z toward the camera. The centres of the pickers stay within x, y = -0.28 to 0.28 m and
     z = 0.02 to 0.20 m. A picker keeps the offset at which it took a node. It pulls with 2.5 N at most (the rope weighs 1 N):
     when the rope cannot follow it stays behind. Two pickers that hold the rope cannot be sent farther apart than the rope
-    between them is long.
+    between them is long. With `keep_hold=True` both hold all the time, whatever elements 3 and 7 say.
 
     ## Observation Space
 
@@ -79,7 +79,10 @@ class StraightenRopeEnv(SoftbodyEnv):
 
     ## Arguments
 
-    See `SoftbodyEnv`.
+    See `SoftbodyEnv`, and
+
+    * `keep_hold` (default `False`): a picker takes the rope when it comes near it and never lets go; what is left to decide
+      is where the pickers go.
 
     ## Differences from SoftGym
 
@@ -101,7 +104,6 @@ class StraightenRopeEnv(SoftbodyEnv):
     """
 
     camera: ClassVar[Camera] = Camera(position=(0.0, 0.0, 0.93), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-    action_size: ClassVar[int] = 8
     state_names: ClassVar[tuple[str, ...]] = (
         *(f"node {node} {axis}" for node in KEY_NODES for axis in "xyz"),
         *(f"picker {picker} {axis}" for picker in (0, 1) for axis in "xyz"),
@@ -117,10 +119,9 @@ class StraightenRopeEnv(SoftbodyEnv):
         world.add_floor()
         self.rope = Rope(world, crumpled(self.variation, rng))
         self.pickers = Pickers(world, self.rope, PICKER_STARTS, LOW, HIGH, PICKER_RADIUS, GRASP_RANGE)
-        self._nodes = self.rope.nodes()
+        self._locate()
 
-    def _control(self, action: np.ndarray) -> None:
-        self.pickers.control(action)
+    def _locate(self) -> None:
         self._nodes = self.rope.nodes()
 
     def fault(self) -> str | None:

@@ -82,19 +82,34 @@ def delta_orthogonal_(weight: th.Tensor, gain: float) -> None:
         nn.init.orthogonal_(weight[:, :, weight.shape[2] // 2, weight.shape[3] // 2], gain)
 
 
-def make_conv_trunk(image_shape: tuple[int, ...], n_filters: int, strides: Sequence[int]) -> tuple[nn.Sequential, int]:
+class CenteredConv2d(nn.Conv2d):
+    """
+    A convolution, without padding, of images in [0, 1] minus one half. The subtraction is one of sums of weights and costs
+    no pass over the images.
+    """
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        offset = self.bias - 0.5 * self.weight.sum(dim=(1, 2, 3))  # type: ignore[operator]
+        return self._conv_forward(images, self.weight, offset)
+
+
+def make_conv_trunk(
+    image_shape: tuple[int, ...], n_filters: int, strides: Sequence[int], center: bool
+) -> tuple[nn.Sequential, int]:
     """
     3x3 convolutions with ReLU, then a flatten.
 
     :param image_shape: ``(channels, height, width)``
     :param n_filters: Filters of each layer
     :param strides: Stride of each layer
+    :param center: Subtract one half from the images
     :return: The trunk, and the size of its output
     """
     layers: list[nn.Module] = []
     n_channels, height, width = image_shape
     for stride in strides:
-        conv = nn.Conv2d(n_channels, n_filters, kernel_size=3, stride=stride)
+        conv_class = CenteredConv2d if center and not layers else nn.Conv2d
+        conv = conv_class(n_channels, n_filters, kernel_size=3, stride=stride)
         delta_orthogonal_(conv.weight, nn.init.calculate_gain("relu"))
         nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
         layers += [conv, nn.ReLU(inplace=True)]  # a second copy of each activation costs more than the function
@@ -119,6 +134,7 @@ class ConvEncoder(Encoder):
     :param strides: Stride of each convolution. (2, 1, 1, 1) in CURL, DrQ and at the paper's scale;
         the default costs a sixth of it and suits a laptop
     :param tanh: Squash the projected features into [-1, 1]
+    :param center: Subtract one half from the images, which are in [0, 1] then
     :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
     """
 
@@ -129,6 +145,7 @@ class ConvEncoder(Encoder):
         n_filters: int = 32,
         strides: Sequence[int] = (2, 2, 2, 1),
         tanh: bool = True,
+        center: bool = False,
         normalized_image: bool = False,
     ):
         # An assertion as in SB3's NatureCNN: callers that handle the one handle the other
@@ -137,7 +154,7 @@ class ConvEncoder(Encoder):
             f"not {observation_space}. Use MlpPolicy for vectors, MultiInputPolicy for Dict observations, or "
             "policy_kwargs=dict(normalize_images=False) when the images are normalized already."
         )
-        trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides)  # type: ignore[arg-type]
+        trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides, center and not normalized_image)  # type: ignore[arg-type]
         super().__init__(observation_space, [trunk_dim], features_dim, tanh)
         self.trunk = trunk
 
@@ -183,6 +200,7 @@ class CombinedEncoder(Encoder):
     :param strides: Stride of each convolution, see ``ConvEncoder``
     :param hidden_dim: Size of the hidden layer for vectors
     :param tanh: Squash the projected features into [-1, 1]
+    :param center: Subtract one half from the images, which are in [0, 1] then
     :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
     """
 
@@ -194,13 +212,14 @@ class CombinedEncoder(Encoder):
         strides: Sequence[int] = (2, 2, 2, 1),
         hidden_dim: int = 256,
         tanh: bool = True,
+        center: bool = False,
         normalized_image: bool = False,
     ):
         trunks, block_dims, vector_dim = {}, [], 0
         vector_keys = []
         for key, space in observation_space.spaces.items():
             if is_image_space(space, normalized_image=normalized_image):
-                trunks[key], block_dim = make_conv_trunk(space.shape, n_filters, strides)  # type: ignore[arg-type]
+                trunks[key], block_dim = make_conv_trunk(space.shape, n_filters, strides, center and not normalized_image)  # type: ignore[arg-type]
                 block_dims.append(block_dim)
             else:
                 vector_keys.append(key)

@@ -1,0 +1,120 @@
+"""
+How soon does an encoder see where things are? Trains encoders, by regression, to tell from an image of the rope where the
+second picker and both ends are, seen from the first picker.
+
+    python benchmarks/encoders.py [--json]         about ten minutes
+
+`error_cm` is the root mean square error along x and y in scenes that were not trained on; `constant` is what the mean of the
+training data would give. A picker takes an end within 5 cm. Images are shifted at random as in training.
+"""
+
+import argparse
+import json
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+import softbody_envs  # noqa: F401  registers the tasks
+from sb3_por.augmentations import RandomShift
+from sb3_por.encoders import ConvEncoder
+from softbody_envs.experts import make_expert
+from softbody_envs.sim.pickers import REACH
+from softbody_envs.variations import SPLITS
+
+ENV = "StraightenRope-v0"
+STEPS = 40
+ENCODERS: dict[str, dict[str, Any]] = {
+    "of the settings": dict(strides=(4, 2, 1), n_filters=16),
+    "of the settings, centered": dict(strides=(4, 2, 1), n_filters=16, center=True),
+    "default": dict(),
+    "default, centered": dict(center=True),
+}
+
+
+def ways(state: np.ndarray) -> np.ndarray:
+    """From picker 0 to the end that is nearer to it, to the other end, and to picker 1: x and y, 0.08 m, ``(6,)``."""
+    first, second = sorted((state[38:41], state[41:44]), key=lambda way: float(np.linalg.norm(way)))
+    return np.concatenate([first[:2], second[:2], (state[33:35] - state[30:32]) / REACH])
+
+
+def collect(split: str, scenes: int, image_size: int, rng: np.random.Generator) -> tuple[th.Tensor, th.Tensor]:
+    """Every second frame of play that is partly random, partly the expert's, and where things are in it."""
+    env = gym.make(ENV, obs_type="dict", image_size=image_size, split=split)
+    expert = make_expert(ENV)
+    images, targets = [], []
+    for variation in list(SPLITS[split])[:scenes]:
+        observation, _ = env.reset(options={"variation": variation})
+        expert.reset()
+        share = rng.choice([0.0, 0.3, 0.7, 1.0])
+        for step in range(STEPS):
+            if step % 3 == 0:
+                random_action, is_random = rng.uniform(-1, 1, 8), rng.random() < share
+            wanted = expert.act(observation["state"]) + 0.2 * rng.normal(size=8)
+            action = np.clip(random_action if is_random else wanted, -1, 1).astype(np.float32)
+            observation, *_ = env.step(action)
+            if step % 2 == 0:
+                images.append(observation["image"])
+                targets.append(ways(observation["state"]))
+    env.close()
+    return th.as_tensor(np.array(images)).permute(0, 3, 1, 2).contiguous(), th.as_tensor(np.array(targets)).float()
+
+
+def train(
+    options: dict[str, Any], data: tuple[th.Tensor, th.Tensor], held_out: tuple[th.Tensor, th.Tensor], updates: int, batch: int
+) -> tuple[float, float]:
+    """
+    :return: error on the held-out frames, cm, and seconds of training
+    """
+    th.manual_seed(0)
+    (images, targets), (new_images, new_targets) = data, held_out
+    encoder = ConvEncoder(spaces.Box(0, 255, images.shape[1:], np.uint8), **options)
+    head = nn.Sequential(nn.Linear(encoder.features_dim, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 6))
+    network = nn.Sequential(encoder, encoder.make_projection(), head)
+    optimizer = th.optim.Adam(network.parameters(), lr=7e-4, fused=True)
+    augment = RandomShift()
+    before = time.perf_counter()
+    for _ in range(updates):
+        rows = th.randint(0, len(images), (batch,))
+        loss = nn.functional.mse_loss(network(augment(images[rows]).float() / 255), targets[rows])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    seconds = time.perf_counter() - before
+    with th.no_grad():
+        outputs = th.cat([network(part.float() / 255) for part in new_images.split(500)])
+    return error_cm(outputs, new_targets), seconds
+
+
+def error_cm(outputs: th.Tensor, targets: th.Tensor) -> float:
+    """Root mean square error, cm."""
+    return 100 * REACH * (outputs - targets).square().mean().sqrt().item()
+
+
+def main() -> None:
+    """Do what the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
+    parser.add_argument("--image-size", type=int, default=64, help="pixels")
+    parser.add_argument("--batch", type=int, default=64, help="frames per update")
+    parser.add_argument("--updates", type=int, default=1000)
+    parser.add_argument("--scenes", type=int, default=300, help="scenes to train on; a tenth as many are held out")
+    arguments = parser.parse_args()
+    th.set_num_threads(1)
+    rng = np.random.default_rng(0)
+    data = collect("train", arguments.scenes, arguments.image_size, rng)
+    held_out = collect("eval", max(1, arguments.scenes // 10), arguments.image_size, rng)
+    rows = [{"encoder": "constant", "seconds": 0.0, "error_cm": round(error_cm(data[1].mean(0), held_out[1]), 1)}]
+    for name, options in ENCODERS.items():
+        error, seconds = train(options, data, held_out, arguments.updates, arguments.batch)
+        rows.append({"encoder": name, "seconds": round(seconds, 1), "error_cm": round(error, 1)})
+    lines = [f"{row['encoder']:28s}{row['error_cm']:6.1f} cm{row['seconds']:8.1f} s" for row in rows]
+    print(json.dumps(rows, indent=1) if arguments.json else "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

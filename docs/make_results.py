@@ -124,9 +124,9 @@ def courses(suite: str) -> str:
     return markdown(("", "seed", "best evaluation", "mean of the last four", "last", "minutes"), rows)
 
 
-def trials() -> str:
-    """Single runs with other settings: every evaluation."""
-    scores = read_scores([RESULTS / "trials" / "scores.csv"])
+def evaluations(folder: str) -> str:
+    """Single runs: every evaluation."""
+    scores = read_scores([RESULTS / folder / "scores.csv"])
     rows = []
     for (env_id, name, seed), run in scores.groupby(["env", "algo", "seed"]):
         run = run.sort_values("step")
@@ -213,7 +213,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "weights": weights,
     "longer": lambda: courses("long"),
     "steady": lambda: courses("steady"),
-    "trials": trials,
+    "trials": lambda: evaluations("trials"),
+    "fold": lambda: evaluations("fold"),
     "state": state,
     "diagnosis": lambda: diagnosis("main"),
     "diagnosis_full_speed": lambda: diagnosis("full_speed"),
@@ -233,7 +234,7 @@ def fill_in(page: str) -> str:
 
 def draw() -> None:
     """The figures of scores and of order."""
-    for suite in ("main", "full_speed", "weights", "long", "steady", "state"):
+    for suite in ("main", "full_speed", "weights", "long", "steady", "fold", "state"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     for suite in ("main", "full_speed"):

@@ -2,7 +2,7 @@
 How soon does an encoder see where things are? Trains encoders, by regression, to tell from an image of the rope where the
 second picker and both ends are, seen from the first picker.
 
-    python benchmarks/encoders.py [--json]         about ten minutes
+    python benchmarks/encoders.py [--json]         about four minutes
 
 `error_cm` is the root mean square error along x and y in scenes that were not trained on; `constant` is what the mean of the
 training data would give. A picker takes an end within 5 cm. Images are shifted at random as in training.

@@ -33,6 +33,7 @@ ENCODERS: dict[str, dict[str, Any]] = {
     "of the settings, centered": dict(strides=(4, 2, 1), n_filters=16, center=True),
     "default": dict(),
     "default, centered": dict(center=True),
+    "spatial softmax, centered": dict(strides=(2, 2), n_filters=16, center=True, spatial_softmax=True),
 }
 
 

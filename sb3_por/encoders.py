@@ -1,6 +1,8 @@
 """Observation encoders: a trunk that actor and critic may share, and the projection that each of them owns."""
 
+import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import gymnasium as gym
 import torch as th
@@ -93,16 +95,54 @@ class CenteredConv2d(nn.Conv2d):
         return self._conv_forward(images, self.weight, offset)
 
 
+class SpatialSoftmax(nn.Module):
+    """
+    Where each map is large: mean and covariance of the position under a softmax over its pixels, with a learned temperature a
+    map. Means are the feature points of https://arxiv.org/abs/1504.00702; two things that look the same have one mean,
+    and their distance and direction are in the covariance.
+
+    :param n_maps: Number of maps
+    :param height: Of a map, pixels
+    :param width: Of a map, pixels
+    :param temperature: What the maps are divided by at first
+    """
+
+    #: Features of one map
+    N_MOMENTS: ClassVar[int] = 5
+
+    monomials: th.Tensor
+
+    def __init__(self, n_maps: int, height: int, width: int, temperature: float = 0.25):
+        super().__init__()
+        self.log_temperature = nn.Parameter(th.full((n_maps,), math.log(temperature)))
+        rows, columns = th.meshgrid(th.linspace(-1, 1, height), th.linspace(-1, 1, width), indexing="ij")
+        x, y = columns.flatten(), rows.flatten()
+        self.register_buffer("monomials", th.stack([x, y, x * x, y * y, x * y]), persistent=False)
+
+    def forward(self, maps: th.Tensor) -> th.Tensor:
+        """
+        :param maps: Shape ``(batch, n_maps, height, width)``
+        :return: Means of x (to the right) and y (down), in [-1, 1], variances of x and y, and covariance, each of all maps,
+            shape ``(batch, 5 * n_maps)``
+        """
+        # Pixels before maps, as channels-last memory has them
+        pixels = maps.permute(0, 2, 3, 1).flatten(1, 2)
+        shares = (pixels * th.exp(-self.log_temperature)).softmax(dim=1)
+        x, y, xx, yy, xy = (self.monomials @ shares).unbind(dim=1)
+        return th.cat([x, y, xx - x * x, yy - y * y, xy - x * y], dim=1)
+
+
 def make_conv_trunk(
-    image_shape: tuple[int, ...], n_filters: int, strides: Sequence[int], center: bool
+    image_shape: tuple[int, ...], n_filters: int, strides: Sequence[int], center: bool, spatial_softmax: bool = False
 ) -> tuple[nn.Sequential, int]:
     """
-    3x3 convolutions with ReLU, then a flatten.
+    3x3 convolutions with ReLU, then a flatten or a spatial softmax.
 
     :param image_shape: ``(channels, height, width)``
     :param n_filters: Filters of each layer
     :param strides: Stride of each layer
     :param center: Subtract one half from the images
+    :param spatial_softmax: End with a spatial softmax of the last convolution, which has no ReLU then
     :return: The trunk, and the size of its output
     """
     layers: list[nn.Module] = []
@@ -119,22 +159,30 @@ def make_conv_trunk(
                 f"Images of {image_shape[1]}x{image_shape[2]} pixels are too small for 3x3 convolutions with strides "
                 f"{tuple(strides)}: use larger images or fewer and smaller strides (features_extractor_kwargs)."
             )
+    if spatial_softmax:
+        layers[-1] = SpatialSoftmax(n_channels, height, width)
+        trunk_dim = SpatialSoftmax.N_MOMENTS * n_channels
+    else:
+        layers.append(nn.Flatten())
+        trunk_dim = n_channels * height * width
     # With channels last the strided layers are 1.1-1.5 times as fast on CPU
-    trunk = nn.Sequential(*layers, nn.Flatten()).to(memory_format=th.channels_last)  # type: ignore[call-overload]
-    return trunk, n_channels * height * width
+    return nn.Sequential(*layers).to(memory_format=th.channels_last), trunk_dim  # type: ignore[call-overload]
 
 
 class ConvEncoder(Encoder):
     """
-    The convolutional encoder of CURL and DrQ: 3x3 convolutions, then Linear -> 50 -> LayerNorm (-> tanh).
+    The convolutional encoder of CURL and DrQ: 3x3 convolutions, then Linear -> 50 -> LayerNorm (-> tanh). With
+    ``spatial_softmax`` the features are positions in the image, which tell where small things are after fewer updates;
+    nothing is projected then.
 
     :param observation_space: Image space, channels first
-    :param features_dim: Size of the projected features
+    :param features_dim: Size of the projected features; with ``spatial_softmax`` there are ``5 * n_filters`` features
     :param n_filters: Filters of each convolution
     :param strides: Stride of each convolution. (2, 1, 1, 1) in CURL, DrQ and at the paper's scale;
         the default costs a sixth of it and suits a laptop
     :param tanh: Squash the projected features into [-1, 1]
     :param center: Subtract one half from the images, which are in [0, 1] then
+    :param spatial_softmax: The features are where each filter of the last convolution responds (``SpatialSoftmax``)
     :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
     """
 
@@ -146,6 +194,7 @@ class ConvEncoder(Encoder):
         strides: Sequence[int] = (2, 2, 2, 1),
         tanh: bool = True,
         center: bool = False,
+        spatial_softmax: bool = False,
         normalized_image: bool = False,
     ):
         # An assertion as in SB3's NatureCNN: callers that handle the one handle the other
@@ -154,9 +203,14 @@ class ConvEncoder(Encoder):
             f"not {observation_space}. Use MlpPolicy for vectors, MultiInputPolicy for Dict observations, or "
             "policy_kwargs=dict(normalize_images=False) when the images are normalized already."
         )
-        trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides, center and not normalized_image)  # type: ignore[arg-type]
-        super().__init__(observation_space, [trunk_dim], features_dim, tanh)
+        center = center and not normalized_image
+        trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides, center, spatial_softmax)  # type: ignore[arg-type]
+        super().__init__(observation_space, [trunk_dim], trunk_dim if spatial_softmax else features_dim, tanh)
         self.trunk = trunk
+        self.spatial_softmax = spatial_softmax
+
+    def make_projection(self) -> nn.Module:
+        return nn.Identity() if self.spatial_softmax else super().make_projection()
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return self.trunk(observations.contiguous(memory_format=th.channels_last))

@@ -6,7 +6,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_por.encoders import CenteredConv2d, CombinedEncoder, ConvEncoder
+from sb3_por.encoders import CenteredConv2d, CombinedEncoder, ConvEncoder, SpatialSoftmax
 
 SPACE = spaces.Box(0, 255, (3, 32, 32), np.uint8)
 
@@ -35,3 +35,62 @@ def test_center_subtracts_one_half_once_and_only_from_images_in_0_1(center, norm
     # At first the biases are 0
     assert encoder(gray).any().item() is not centered
     assert combined({"image": gray}).any().item() is not centered
+
+
+def test_spatial_softmax_tells_mean_and_covariance_of_where_a_map_is_large():
+    softmax = SpatialSoftmax(2, 3, 5)
+    maps = th.full((1, 2, 3, 5), -100.0)
+    maps[0, 0, 0, 3] = 0.0  # one peak: above, to the right
+    maps[0, 1, 0, 0] = maps[0, 1, 2, 4] = 0.0  # two: above to the left, below to the right
+    features = softmax(maps).reshape(5, 2)
+    th.testing.assert_close(features[:, 0], th.tensor([0.5, -1.0, 0.0, 0.0, 0.0]))
+    th.testing.assert_close(features[:, 1], th.tensor([0.0, 0.0, 1.0, 1.0, 1.0]))
+
+
+def test_spatial_softmax_learns_a_temperature_for_each_map():
+    softmax = SpatialSoftmax(2, 4, 4, temperature=0.5)
+    maps = th.randn(3, 2, 4, 4)
+    sharper = SpatialSoftmax(2, 4, 4, temperature=0.25)
+    th.testing.assert_close(softmax(2 * maps), sharper(maps))
+    softmax(maps)[:, 0].sum().backward()  # x of the first map
+    gradient = softmax.log_temperature.grad
+    assert gradient[0] != 0 and gradient[1] == 0
+
+
+def test_an_encoder_with_spatial_softmax_gives_positions_unprojected():
+    encoder = ConvEncoder(SPACE, n_filters=4, strides=(2, 2), spatial_softmax=True)
+    assert encoder.features_dim == 20
+    assert isinstance(encoder.make_projection(), nn.Identity)
+    images = th.rand(2, *SPACE.shape).to(memory_format=th.channels_last)
+    features = encoder(images)
+    assert features.shape == (2, 20)
+    # Darker or brighter by the same amount everywhere is the same place, since nothing is cut off after the last layer
+    bare = ConvEncoder(SPACE, n_filters=4, strides=(2,), spatial_softmax=True)
+    th.testing.assert_close(bare(images), bare(images + 0.3), atol=1e-5, rtol=1e-4)
+
+
+def test_spatial_softmax_sees_where_two_equal_dots_are_sooner():
+    def error(**options) -> float:
+        th.manual_seed(0)
+        encoder = ConvEncoder(SPACE, n_filters=8, strides=(2, 2), center=True, **options)
+        head = nn.Sequential(nn.Linear(encoder.features_dim, 64), nn.ReLU(), nn.Linear(64, 3))
+        network = nn.Sequential(encoder, encoder.make_projection(), head)
+        optimizer = th.optim.Adam(network.parameters(), lr=2e-3)
+        losses = []
+        for _ in range(100):
+            places = th.randint(2, 29, (32, 2, 2))  # image, dot, row and column
+            pixels = th.stack(th.meshgrid(th.arange(32), th.arange(32), indexing="ij"))
+            offsets = pixels - places[..., None, None]
+            dots = ((offsets >= 0) & (offsets < 2)).all(dim=2).any(dim=1)
+            images = 0.9 - 0.7 * dots[:, None] * th.tensor([1.0, 1.0, 0.0])[:, None, None]
+            first, second = (places / 16.0 - 1.0).unbind(dim=1)
+            target = th.cat([(first + second) / 2, (first - second).norm(dim=1, keepdim=True)], dim=1)
+            loss = (network(images) - target).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(loss.item())
+        return float(np.mean(losses[-20:]))
+
+    positions, flat = error(spatial_softmax=True), error()
+    assert positions < 0.5 * flat, (positions, flat)

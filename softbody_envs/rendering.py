@@ -98,12 +98,25 @@ def backdrop(camera: Camera, size: int, floor: Floor | None) -> np.ndarray:
     """
     image = np.full((size, size, 3), SKY_COLOR, np.uint8)
     if floor is not None:
-        across = (2 * np.arange(size) + 1 - size) / size * np.tan(np.radians(camera.fov) / 2)
-        right, up, back = np.reshape(camera.view, (4, 4), order="F")[:3, :3]
-        rays = across[None, :, None] * right - across[:, None, None] * up - back
-        with np.errstate(divide="ignore"):
-            way = (floor.height - camera.position[2]) / rays[:, :, 2]
-        where = np.abs(camera.position[:2] + way[:, :, None] * rays[:, :, :2]).max(axis=-1)
-        image[(way > 0) & (where <= floor.half_size)] = FLOOR_COLOR
+        image[on_floor(camera, size, floor)[1]] = FLOOR_COLOR
     image.flags.writeable = False
     return image
+
+
+@lru_cache(maxsize=32)
+def on_floor(camera: Camera, size: int, floor: Floor) -> tuple[np.ndarray, np.ndarray]:
+    """
+    What a camera sees of a floor.
+
+    :return: the points of the floor's plane behind the pixels, m, ``(size, size, 3)``, and which of them the camera sees
+        and belong to the floor, bool ``(size, size)``; to read from
+    """
+    across = (2 * np.arange(size) + 1 - size) / size * np.tan(np.radians(camera.fov) / 2)
+    right, up, back = np.reshape(camera.view, (4, 4), order="F")[:3, :3]
+    rays = across[None, :, None] * right - across[:, None, None] * up - back
+    with np.errstate(divide="ignore", invalid="ignore"):
+        way = (floor.height - camera.position[2]) / rays[:, :, 2]
+        points = camera.position + way[:, :, None] * rays
+        seen = (way > 0) & (np.abs(points[:, :, :2]).max(axis=-1) <= floor.half_size)
+    points.flags.writeable = seen.flags.writeable = False
+    return points, seen

@@ -1,15 +1,18 @@
-"""A drawn cloth shows its side, hides what is behind it, and is hidden by what is in front."""
+"""A drawn cloth shows its side, hides what is behind it, and is hidden by what is in front. A shadow tells a height."""
 
 import numpy as np
 import pytest
 
-from softbody_envs.painting import paint_sheet
-from softbody_envs.rendering import Camera
+from softbody_envs.painting import LIGHT, paint_shadows, paint_sheet
+from softbody_envs.rendering import FLOOR_COLOR, Camera
 from softbody_envs.sim.cloth import flat_grid
+from softbody_envs.sim.world import Floor
 
 FACE, UNDERSIDE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 SIZES = (64, 84, 128)
 CAMERA = Camera(position=(0.0, -0.82, 0.82), target=(0.0, 0.0, 0.0))
+ABOVE = Camera(position=(0.0, 0.0, 0.93), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
+FLOOR = Floor(0.0, half_size=3.0)
 
 
 def paint(grid, size=84, camera=CAMERA, depth=1.0):
@@ -78,3 +81,33 @@ def test_light_and_shade_tell_slopes_apart():
 def test_a_sheet_may_leave_the_image(shift):
     frame = paint(flat_grid(0.5, 0.5) + np.array(shift))
     assert frame.shape == (84, 84, 3)
+
+
+def shadow(center, radius=0.05, size=256, depth=1.0, floor=FLOOR):
+    """Where a frame gets darker, bool."""
+    frame = np.full((size, size, 3), FLOOR_COLOR, np.uint8)
+    paint_shadows(frame, np.broadcast_to(np.float32(depth), (size, size)), ABOVE, floor, np.array([center]), radius)
+    return (frame < FLOOR_COLOR).all(axis=-1)
+
+
+@pytest.mark.parametrize("height", (0.05, 0.2))
+def test_a_shadow_falls_away_from_the_light_by_the_height_of_the_sphere(height):
+    rows, columns = np.nonzero(shadow((0.1, -0.05, height)))
+    metres = 2 * 0.93 * np.tan(np.radians(45 / 2)) / 256  # that a pixel covers
+    place = np.array([columns.mean() - 127.5, 127.5 - rows.mean()]) * metres
+    assert place == pytest.approx(np.array([0.1, -0.05]) - height * LIGHT[:2] / LIGHT[2], abs=metres)
+    # A disc, stretched by the slant of the light
+    assert len(rows) * metres**2 == pytest.approx(np.pi * 0.05**2 / LIGHT[2], rel=0.03)
+
+
+def test_a_shadow_falls_on_the_floor_alone():
+    assert shadow((0.0, 0.0, 0.1)).any()
+    assert not shadow((0.0, 0.0, 0.1), depth=0.5).any()  # a body is there
+    assert not shadow((0.0, 0.0, 0.1), radius=0.03, floor=Floor(0.0, half_size=0.01)).any()
+
+
+def test_shadows_of_several_spheres_are_drawn():
+    frame = np.full((64, 64, 3), FLOOR_COLOR, np.uint8)
+    centers = np.array([(-0.2, 0.0, 0.1), (0.2, 0.0, 0.1)])
+    paint_shadows(frame, np.ones((64, 64), np.float32), ABOVE, FLOOR, centers, 0.03)
+    assert (frame[:, :32] < FLOOR_COLOR).any() and (frame[:, 32:] < FLOOR_COLOR).any()

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from softbody_envs.experts import make_expert
+from softbody_envs.painting import AMBIENT
+from softbody_envs.rendering import FLOOR_COLOR
 from softbody_envs.sim import rope_bank
 from softbody_envs.sim.pickers import Pickers
 from softbody_envs.sim.rope import LENGTH, N_NODES, RADIUS, SPACING, STEPS_PER_CONTROL, Rope, end_distance, failure, length
@@ -404,3 +406,22 @@ def test_image_shows_both_pickers_wherever_they_are_and_both_ends():
         assert ((red > green + 60) & (red > blue + 60)).sum() >= 4
         assert ((green > red + 40) & (green > blue + 40)).sum() >= 4
     env.close()
+
+
+def test_the_image_tells_how_high_a_picker_is():
+    env = gym.make("StraightenRope-v0", obs_type="pixels", image_size=84).unwrapped
+    env.reset(options={"variation": 0})
+
+    def shadow_rows():
+        gray = np.isclose(env._image(84), round(AMBIENT * FLOOR_COLOR)).all(axis=-1)
+        return np.nonzero(gray)[0].mean()  # the light comes from below in the image: the higher, the farther up
+
+    aside = np.array([1.0, 0.0, 0.0, -1.0] * 2)
+    for _ in range(4):
+        env.step(aside)
+    rows = []
+    for _ in range(3):
+        rows.append(shadow_rows())
+        env.step(np.array([0.0, 0.0, -0.4, -1.0] * 2))
+    env.close()
+    assert rows[0] + 1 < rows[1] and rows[1] + 1 < rows[2]

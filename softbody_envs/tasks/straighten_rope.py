@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from softbody_envs.painting import paint_shadows
 from softbody_envs.rendering import Camera
 from softbody_envs.sim.pickers import REACH, Pickers
 from softbody_envs.sim.rope import LENGTH, STEPS_PER_CONTROL, Rope, end_distance, failure
@@ -30,7 +31,7 @@ class StraightenRopeEnv(PickerEnv):
     far apart as the rope is long.
 
     The rope is 0.5 m long: 20 rigid segments in a chain, in Bullet's rigid world. It is blue with yellow ends. A picker is a
-    sphere, red or green, dark while it holds something.
+    sphere, red or green, dark while it holds something; the farther its shadow is from it the higher it is.
 
     ## Action Space
 
@@ -132,6 +133,11 @@ class StraightenRopeEnv(PickerEnv):
         pickers = self.pickers.positions
         reaches = (self._nodes[[0, -1]] - pickers[:, None]) / REACH
         return np.concatenate([self._nodes[list(KEY_NODES)].ravel(), pickers.ravel(), holds, reaches.ravel()])
+
+    def _image(self, size: int) -> np.ndarray:
+        frame, depth = self.renderer.render(self.world, self.camera, size)
+        paint_shadows(frame, depth, self.camera, self.world.floor, self.pickers.positions, PICKER_RADIUS)
+        return frame
 
     def performance(self) -> float:
         """How far the distance between the ends is from the rope's length, m, negative."""

@@ -1,11 +1,12 @@
 """
 How soon does an encoder see where things are? Trains encoders, by regression, to tell from an image of the rope where the
-second picker and both ends are, seen from the first picker.
+second picker and both ends are, seen from the first picker, and how high both pickers are.
 
-    python benchmarks/encoders.py [--json]         about four minutes
+    python benchmarks/encoders.py [--json]         about five minutes
 
-`error_cm` is the root mean square error along x and y in scenes that were not trained on; `constant` is what the mean of the
-training data would give. A picker takes an end within 5 cm. Images are shifted at random as in training.
+`error_cm` is the root mean square error along x and y in scenes that were not trained on, `height_cm` that of the heights;
+`constant` is what the mean of the training data would give. A picker takes an end within 5 cm. Images are shifted at random
+as in training.
 """
 
 import argparse
@@ -28,6 +29,8 @@ from softbody_envs.variations import SPLITS
 
 ENV = "StraightenRope-v0"
 STEPS = 40
+#: Targets along x and y; those after them are heights.
+N_FLAT = 6
 ENCODERS: dict[str, dict[str, Any]] = {
     "of the settings": dict(strides=(4, 2, 1), n_filters=16),
     "of the settings, centered": dict(strides=(4, 2, 1), n_filters=16, center=True),
@@ -38,9 +41,12 @@ ENCODERS: dict[str, dict[str, Any]] = {
 
 
 def ways(state: np.ndarray) -> np.ndarray:
-    """From picker 0 to the end that is nearer to it, to the other end, and to picker 1: x and y, 0.08 m, ``(6,)``."""
+    """
+    From picker 0 to the end that is nearer to it, to the other end, and to picker 1: x and y. Then the heights of picker 0 and
+    1. In 0.08 m, ``(8,)``.
+    """
     first, second = sorted((state[38:41], state[41:44]), key=lambda way: float(np.linalg.norm(way)))
-    return np.concatenate([first[:2], second[:2], (state[33:35] - state[30:32]) / REACH])
+    return np.concatenate([first[:2], second[:2], (state[33:35] - state[30:32]) / REACH, state[[32, 35]] / REACH])
 
 
 def collect(split: str, scenes: int, image_size: int, rng: np.random.Generator) -> tuple[th.Tensor, th.Tensor]:
@@ -67,14 +73,16 @@ def collect(split: str, scenes: int, image_size: int, rng: np.random.Generator) 
 
 def train(
     options: dict[str, Any], data: tuple[th.Tensor, th.Tensor], held_out: tuple[th.Tensor, th.Tensor], updates: int, batch: int
-) -> tuple[float, float]:
+) -> dict[str, float]:
     """
-    :return: error on the held-out frames, cm, and seconds of training
+    :return: errors on the held-out frames and seconds of training
     """
     th.manual_seed(0)
     (images, targets), (new_images, new_targets) = data, held_out
     encoder = ConvEncoder(spaces.Box(0, 255, images.shape[1:], np.uint8), **options)
-    head = nn.Sequential(nn.Linear(encoder.features_dim, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 6))
+    head = nn.Sequential(
+        nn.Linear(encoder.features_dim, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, targets.shape[1])
+    )
     network = nn.Sequential(encoder, encoder.make_projection(), head)
     optimizer = th.optim.Adam(network.parameters(), lr=7e-4, fused=True)
     augment = RandomShift()
@@ -88,12 +96,14 @@ def train(
     seconds = time.perf_counter() - before
     with th.no_grad():
         outputs = th.cat([network(part.float() / 255) for part in new_images.split(500)])
-    return error_cm(outputs, new_targets), seconds
+    return {"seconds": round(seconds, 1), **errors(outputs, new_targets)}
 
 
-def error_cm(outputs: th.Tensor, targets: th.Tensor) -> float:
-    """Root mean square error, cm."""
-    return 100 * REACH * (outputs - targets).square().mean().sqrt().item()
+def errors(outputs: th.Tensor, targets: th.Tensor) -> dict[str, float]:
+    """Root mean square errors, cm."""
+    parts = {"error_cm": slice(None, N_FLAT), "height_cm": slice(N_FLAT, None)}
+    squares = (outputs - targets).square()
+    return {name: round(100 * REACH * squares[:, part].mean().sqrt().item(), 1) for name, part in parts.items()}
 
 
 def main() -> None:
@@ -109,11 +119,10 @@ def main() -> None:
     rng = np.random.default_rng(0)
     data = collect("train", arguments.scenes, arguments.image_size, rng)
     held_out = collect("eval", max(1, arguments.scenes // 10), arguments.image_size, rng)
-    rows = [{"encoder": "constant", "seconds": 0.0, "error_cm": round(error_cm(data[1].mean(0), held_out[1]), 1)}]
+    rows: list[dict[str, Any]] = [{"encoder": "constant", "seconds": 0.0, **errors(data[1].mean(0), held_out[1])}]
     for name, options in ENCODERS.items():
-        error, seconds = train(options, data, held_out, arguments.updates, arguments.batch)
-        rows.append({"encoder": name, "seconds": round(seconds, 1), "error_cm": round(error, 1)})
-    lines = [f"{row['encoder']:28s}{row['error_cm']:6.1f} cm{row['seconds']:8.1f} s" for row in rows]
+        rows.append({"encoder": name, **train(options, data, held_out, arguments.updates, arguments.batch)})
+    lines = [f"{row['encoder']:28s}{row['error_cm']:6.1f} cm{row['height_cm']:6.1f} cm{row['seconds']:8.1f} s" for row in rows]
     print(json.dumps(rows, indent=1) if arguments.json else "\n".join(lines))
 
 

@@ -97,7 +97,7 @@ class StraightenRopeEnv(PickerEnv):
       to do, or the image would not show what to do.
     * The ends are marked: in a heap of rope they look like bends.
     * Pickers do not push the rope. Their box is smaller (0.33 m and 0.28 m in SoftGym) and the camera higher (0.85 m
-      there): the pickers never leave the image.
+      there): the pickers never leave the image. Only they cast shadows, on the floor; in SoftGym all things do.
 
     ## Version History
 

@@ -20,11 +20,13 @@ class Projection(nn.Module):
     :param block_dims: Size of each block of the trunk's output
     :param features_dim: Size of one projected block
     :param tanh: Squash the features into [-1, 1], as DrQ does and CURL does not
+    :param n_positions: Features before the blocks, which stay as they are
     """
 
-    def __init__(self, block_dims: Sequence[int], features_dim: int, tanh: bool = True):
+    def __init__(self, block_dims: Sequence[int], features_dim: int, tanh: bool = True, n_positions: int = 0):
         super().__init__()
         self.block_dims = list(block_dims)
+        self.n_positions = n_positions
         self.blocks = nn.ModuleList()
         for block_dim in self.block_dims:
             layers: list[nn.Module] = [nn.Linear(block_dim, features_dim), nn.LayerNorm(features_dim)]
@@ -33,8 +35,8 @@ class Projection(nn.Module):
             self.blocks.append(nn.Sequential(*layers, nn.Tanh() if tanh else nn.Identity()))
 
     def forward(self, trunk_features: th.Tensor) -> th.Tensor:
-        blocks = trunk_features.split(self.block_dims, dim=1)
-        return th.cat([project(block) for project, block in zip(self.blocks, blocks, strict=True)], dim=1)
+        positions, *blocks = trunk_features.split([self.n_positions, *self.block_dims], dim=1)
+        return th.cat([positions, *(project(block) for project, block in zip(self.blocks, blocks, strict=True))], dim=1)
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -49,19 +51,23 @@ class Encoder(BaseFeaturesExtractor):
     :param block_dims: Size of each block of the trunk's output
     :param features_dim: Size of one projected block
     :param tanh: Squash the projected features into [-1, 1]
+    :param n_positions: Features before the blocks, which are not projected
     """
 
-    def __init__(self, observation_space: gym.Space, block_dims: Sequence[int], features_dim: int, tanh: bool):
-        super().__init__(observation_space, features_dim * len(block_dims))
+    def __init__(
+        self, observation_space: gym.Space, block_dims: Sequence[int], features_dim: int, tanh: bool, n_positions: int = 0
+    ):
+        super().__init__(observation_space, n_positions + features_dim * len(block_dims))
         self.block_dims = list(block_dims)
         self.block_features_dim = features_dim
         self.tanh = tanh
+        self.n_positions = n_positions
 
     def make_projection(self) -> nn.Module:
         """
         :return: A new projection from the trunk's output to ``features_dim`` features
         """
-        return Projection(self.block_dims, self.block_features_dim, self.tanh)
+        return Projection(self.block_dims, self.block_features_dim, self.tanh, self.n_positions)
 
 
 def make_projection(features_extractor: nn.Module) -> nn.Module:
@@ -205,12 +211,9 @@ class ConvEncoder(Encoder):
         )
         center = center and not normalized_image
         trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides, center, spatial_softmax)  # type: ignore[arg-type]
-        super().__init__(observation_space, [trunk_dim], trunk_dim if spatial_softmax else features_dim, tanh)
+        block_dims, n_positions = ([], trunk_dim) if spatial_softmax else ([trunk_dim], 0)
+        super().__init__(observation_space, block_dims, features_dim, tanh, n_positions)
         self.trunk = trunk
-        self.spatial_softmax = spatial_softmax
-
-    def make_projection(self) -> nn.Module:
-        return nn.Identity() if self.spatial_softmax else super().make_projection()
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return self.trunk(observations.contiguous(memory_format=th.channels_last))
@@ -255,6 +258,7 @@ class CombinedEncoder(Encoder):
     :param hidden_dim: Size of the hidden layer for vectors
     :param tanh: Squash the projected features into [-1, 1]
     :param center: Subtract one half from the images, which are in [0, 1] then
+    :param spatial_softmax: Positions instead of blocks for images, see ``ConvEncoder``
     :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
     """
 
@@ -267,21 +271,24 @@ class CombinedEncoder(Encoder):
         hidden_dim: int = 256,
         tanh: bool = True,
         center: bool = False,
+        spatial_softmax: bool = False,
         normalized_image: bool = False,
     ):
-        trunks, block_dims, vector_dim = {}, [], 0
+        center = center and not normalized_image
+        trunks, image_dims, vector_dim = {}, [], 0
         vector_keys = []
         for key, space in observation_space.spaces.items():
             if is_image_space(space, normalized_image=normalized_image):
-                trunks[key], block_dim = make_conv_trunk(space.shape, n_filters, strides, center and not normalized_image)  # type: ignore[arg-type]
-                block_dims.append(block_dim)
+                trunks[key], image_dim = make_conv_trunk(space.shape, n_filters, strides, center, spatial_softmax)  # type: ignore[arg-type]
+                image_dims.append(image_dim)
             else:
                 vector_keys.append(key)
                 vector_dim += get_flattened_obs_dim(space)
+        block_dims, n_positions = ([], sum(image_dims)) if spatial_softmax else (image_dims, 0)
         if vector_dim > 0:
             block_dims.append(hidden_dim)
 
-        super().__init__(observation_space, block_dims, cnn_output_dim, tanh)
+        super().__init__(observation_space, block_dims, cnn_output_dim, tanh, n_positions)
         self.vector_keys = vector_keys
         # A list, not a ModuleDict, whose keys may not be named "keys" or hold a point
         self.image_keys = list(trunks)

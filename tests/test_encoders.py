@@ -60,13 +60,25 @@ def test_spatial_softmax_learns_a_temperature_for_each_map():
 def test_an_encoder_with_spatial_softmax_gives_positions_unprojected():
     encoder = ConvEncoder(SPACE, n_filters=4, strides=(2, 2), spatial_softmax=True)
     assert encoder.features_dim == 20
-    assert isinstance(encoder.make_projection(), nn.Identity)
     images = th.rand(2, *SPACE.shape).to(memory_format=th.channels_last)
     features = encoder(images)
     assert features.shape == (2, 20)
+    assert th.equal(encoder.make_projection()(features), features)
     # Darker or brighter by the same amount everywhere is the same place, since nothing is cut off after the last layer
     bare = ConvEncoder(SPACE, n_filters=4, strides=(2,), spatial_softmax=True)
     th.testing.assert_close(bare(images), bare(images + 0.3), atol=1e-5, rtol=1e-4)
+
+
+def test_a_combined_encoder_gives_positions_of_images_and_projects_vectors():
+    space = spaces.Dict(image=SPACE, second=SPACE, vector=spaces.Box(-1.0, 1.0, (3,), np.float32))
+    encoder = CombinedEncoder(space, cnn_output_dim=6, n_filters=4, strides=(2, 2), hidden_dim=7, spatial_softmax=True)
+    assert encoder.features_dim == 2 * 20 + 6
+    trunk_features = encoder({"image": th.rand(2, *SPACE.shape), "second": th.rand(2, *SPACE.shape), "vector": th.rand(2, 3)})
+    assert trunk_features.shape == (2, 2 * 20 + 7)
+    projected = encoder.make_projection()(trunk_features)
+    assert projected.shape == (2, encoder.features_dim)
+    assert th.equal(projected[:, :40], trunk_features[:, :40])
+    assert projected[:, 40:].abs().max() < 1
 
 
 def test_spatial_softmax_sees_where_two_equal_dots_are_sooner():

@@ -62,15 +62,17 @@ class World:
         if self.client._client >= 0 and self.client.isConnected():
             self.client.disconnect()
 
-    def add_floor(self, height: float = 0.0) -> None:
+    def add_floor(self, height: float = 0.0) -> Floor:
         """
         An infinite half-space that nothing can tunnel through. Rigid worlds only: cloth needs a box.
 
         :param height: of the surface, m
+        :return: ``floor``, as it is now
         """
         plane = self.client.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=(0, 0, 1))
         self._hide(self.client.createMultiBody(0, plane, basePosition=(0, 0, height)))
         self.floor = Floor(height, half_size=3.0)
+        return self.floor
 
     def add_box_floor(self) -> None:
         """A thick slab with its top at z = 0, for deformable worlds: on a plane a cloth never settles."""

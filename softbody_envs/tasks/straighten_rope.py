@@ -117,7 +117,7 @@ class StraightenRopeEnv(PickerEnv):
     steps_per_control: ClassVar[int] = STEPS_PER_CONTROL
 
     def _build(self, world: World, rng: np.random.Generator) -> None:
-        world.add_floor()
+        self._floor = world.add_floor()
         self.rope = Rope(world, crumpled(self.variation, rng))
         self.pickers = Pickers(world, self.rope, PICKER_STARTS, LOW, HIGH, PICKER_RADIUS, GRASP_RANGE)
         self._locate()
@@ -136,7 +136,7 @@ class StraightenRopeEnv(PickerEnv):
 
     def _image(self, size: int) -> np.ndarray:
         frame, depth = self.renderer.render(self.world, self.camera, size)
-        paint_shadows(frame, depth, self.camera, self.world.floor, self.pickers.positions, PICKER_RADIUS)
+        paint_shadows(frame, depth, self.camera, self._floor, self.pickers.positions, PICKER_RADIUS)
         return frame
 
     def performance(self) -> float:

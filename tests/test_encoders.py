@@ -5,7 +5,9 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from torch import nn
+from toy_envs import DotEnv
 
+from sb3_por import ALGORITHMS
 from sb3_por.encoders import CenteredConv2d, CombinedEncoder, ConvEncoder, SpatialSoftmax
 
 SPACE = spaces.Box(0, 255, (3, 32, 32), np.uint8)
@@ -79,6 +81,23 @@ def test_a_combined_encoder_gives_positions_of_images_and_projects_vectors():
     assert projected.shape == (2, encoder.features_dim)
     assert th.equal(projected[:, :40], trunk_features[:, :40])
     assert projected[:, 40:].abs().max() < 1
+
+
+@pytest.mark.parametrize("policy", ["CnnPolicy", "MultiInputPolicy"])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_trains_an_encoder_with_spatial_softmax_and_loads_it(name, policy, tmp_path):
+    env = DotEnv(obs_type="pixels" if policy == "CnnPolicy" else "dict")
+    kwargs = dict(features_extractor_kwargs=dict(n_filters=4, strides=(2, 2), spatial_softmax=True), net_arch=[16])
+    model = ALGORITHMS[name](policy, env, policy_kwargs=kwargs, learning_starts=10, batch_size=8, buffer_size=100, seed=0)
+    before = [parameter.detach().clone() for parameter in model.critic.features_extractor.parameters()]
+    model.learn(30)
+    after = list(model.critic.features_extractor.parameters())
+    assert not any(th.equal(old, new) for old, new in zip(before, after, strict=True))
+    model.save(tmp_path / "model.zip")
+    observation, _ = env.reset(seed=0)
+    action, _ = model.predict(observation, deterministic=True)
+    loaded, _ = ALGORITHMS[name].load(tmp_path / "model.zip").predict(observation, deterministic=True)
+    assert np.array_equal(action, loaded)
 
 
 def test_spatial_softmax_sees_where_two_equal_dots_are_sooner():

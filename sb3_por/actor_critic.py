@@ -44,6 +44,7 @@ class VisualActorCritic(Algorithm):
         ``train()``, SB3 #2158)
     :param ent_coef_lr_ratio: Learning rate of the temperature, in units of ``learning_rate``
     :param reward_scale: Factor on the rewards in the critic's target
+    :param start_at_mean_reward: Let values begin at what the mean reward would be worth for ever, instead of at 0
     :param augmentation_pad: Random shift of images, in pixels; 0 for none
     :param n_augmentations: DrQ's M: augmentations of o_t whose critic losses are averaged
     :param n_target_augmentations: DrQ's K: augmentations of o_{t+1} whose targets are averaged
@@ -91,6 +92,7 @@ class VisualActorCritic(Algorithm):
         target_update_interval: int = 1,
         ent_coef_lr_ratio: float = 1.0,
         reward_scale: float = 1.0,
+        start_at_mean_reward: bool = False,
         augmentation_pad: int = 4,
         n_augmentations: int = 1,
         n_target_augmentations: int = 1,
@@ -107,6 +109,7 @@ class VisualActorCritic(Algorithm):
         self.actor_update_interval = actor_update_interval
         self.ent_coef_lr_ratio = ent_coef_lr_ratio
         self.reward_scale = reward_scale
+        self.start_at_mean_reward = start_at_mean_reward
         self.augmentation_pad = augmentation_pad
         self.n_augmentations = n_augmentations
         self.n_target_augmentations = n_target_augmentations
@@ -117,6 +120,8 @@ class VisualActorCritic(Algorithm):
         self._metrics = Means()
         kwargs["target_update_interval"] = target_update_interval
         super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, *args, **kwargs)
+        if start_at_mean_reward and self.gamma >= 1.0:
+            raise ValueError("start_at_mean_reward needs gamma < 1: a reward that goes on for ever has no finite value")
 
     def _objective(self) -> tuple[type[Objective] | None, dict[str, Any]]:
         """
@@ -242,6 +247,8 @@ class VisualActorCritic(Algorithm):
         if self.use_sde:
             # log_std may have changed since the last update
             self.actor.reset_noise()
+        if self.start_at_mean_reward and self._n_updates == 1:
+            self._start_values(replay_data)
         views = self._preparation.views(replay_data)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
         critic_loss, objective_loss = self._encoder_losses(replay_data, views, ent_coef)
@@ -280,8 +287,7 @@ class VisualActorCritic(Algorithm):
             # All rows at once, before the objective asks for some of them
             views.momentum(name)
         objective_loss = self._objective_loss(views)
-        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
-        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        discounts = self._discounts(replay_data)
         with th.no_grad():
             next_values = [self._value_of(views, name, ent_coef) for name in self._preparation.next_names]
             target = self.reward_scale * replay_data.rewards
@@ -290,6 +296,18 @@ class VisualActorCritic(Algorithm):
             self._critic_loss(views.online(name), replay_data.actions, target) for name in self._preparation.obs_names
         ]
         return th.stack(critic_losses).mean(), objective_loss
+
+    def _discounts(self, replay_data: Any) -> th.Tensor | float:
+        """gamma, or for n-step replay gamma**n_steps (when no early termination)."""
+        return replay_data.discounts if replay_data.discounts is not None else self.gamma
+
+    def _start_values(self, replay_data: Any) -> None:
+        """Move the last biases of all Q networks by the value of this batch's mean reward."""
+        reward = self.reward_scale * replay_data.rewards.mean()
+        goes_on = ((1 - replay_data.dones) * self._discounts(replay_data)).mean()
+        with th.no_grad():
+            for head in [*self.critic.q_networks, *self.critic_target.q_networks]:
+                head[-1].bias += reward / (1 - goes_on)
 
     def _sample(self, batch_size: int) -> Any:
         """A batch from the replay buffer with what the objective asks for."""

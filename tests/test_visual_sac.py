@@ -1,15 +1,17 @@
 """The shared training step: who trains the encoder, how often what is updated, what is logged."""
 
 import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.wrappers import TransformReward
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from toy_envs import DotEnv
 
-from sb3_por import SACPOR, SACDrQ, VisualSAC
+from sb3_por import SACPOR, TQCPOR, SACDrQ, VisualSAC
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
@@ -149,6 +151,44 @@ def test_reward_scale_scales_the_target():
     model.train(1, 8)
     np.random.seed(0)
     th.testing.assert_close(targets[0], 3.0 * model._sample(8).rewards)
+
+
+@pytest.mark.parametrize(("cls", "n_steps"), [(VisualSAC, 1), (VisualSAC, 3), (TQCPOR, 1)])
+def test_values_may_start_at_what_the_mean_reward_is_worth(cls, n_steps):
+    def q_values(start):
+        env = TransformReward(DotEnv(), lambda reward: -2.0)
+        model = make_model(cls, env, gamma=0.9, reward_scale=3.0, n_steps=n_steps, start_at_mean_reward=start)
+        model._start_values = Mock(wraps=model._start_values)
+        model.train(1, 8)
+        model.train(1, 8)
+        assert model._start_values.call_count == int(start)
+        data = model._sample(30)
+        with th.no_grad():
+            return [th.stack(list(net(data.observations, data.actions))).mean() for net in (model.critic, model.critic_target)]
+
+    # -2 a step, times 3, for ever: the sum of 0.9^t is 10
+    assert q_values(True) == pytest.approx([-60.0] * 2, abs=2.0)
+    assert q_values(False) == pytest.approx([0.0] * 2, abs=2.0)
+
+
+def test_a_reward_for_ever_needs_a_discount():
+    with pytest.raises(ValueError, match="gamma < 1"):
+        make_model(gamma=1.0, start_at_mean_reward=True)
+
+
+def test_hidden_units_stay_between_always_and_never_where_values_start_at_the_mean_reward():
+    def share_of_switching_units(start):
+        env = TransformReward(DotEnv(), lambda reward: 20 * (reward - 10.0))
+        model = make_model(env=env, n_collected=100, gamma=0.95, start_at_mean_reward=start, learning_rate=1e-3)
+        model.train(200, 8)
+        data = model._sample(200)
+        with th.no_grad():
+            hidden = th.cat([model.critic.encode(data.observations), data.actions], dim=1)
+            hidden = model.critic.q_networks[0][:-1](hidden)
+        active = (hidden > 0).float().mean(dim=0)
+        return ((active > 0) & (active < 1)).float().mean().item()
+
+    assert share_of_switching_units(True) > share_of_switching_units(False) + 0.2
 
 
 def test_k_and_m_augmentations_are_averaged():

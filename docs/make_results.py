@@ -214,6 +214,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "longer": lambda: courses("long"),
     "steady": lambda: courses("steady"),
     "trials": lambda: evaluations("trials"),
+    "rope": lambda: evaluations("rope"),
     "fold": lambda: evaluations("fold"),
     "state": state,
     "diagnosis": lambda: diagnosis("main"),
@@ -234,7 +235,7 @@ def fill_in(page: str) -> str:
 
 def draw() -> None:
     """The figures of scores and of order."""
-    for suite in ("main", "full_speed", "weights", "long", "steady", "fold", "state"):
+    for suite in ("main", "full_speed", "weights", "long", "steady", "rope", "fold", "state"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     for suite in ("main", "full_speed"):

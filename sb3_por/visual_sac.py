@@ -54,7 +54,7 @@ class VisualSAC(VisualActorCritic, SAC):
     :param reward_scale: Factor on the rewards in the critic's target
     :param start_at_mean_reward: Let values begin at what the mean reward of the first batch would be worth for ever,
         instead of at 0. Where rewards are far from 0 on average, a critic that begins at 0 hurries there for so long that
-        its hidden units end up always active or never, and values linear in features and actions
+        its hidden units end up always active or never, and values nearly linear in features and actions
     :param augmentation_pad: Largest random shift of images in pixels; 0 for none
     :param n_augmentations: Augmentations of each observation, whose critic losses are averaged (DrQ's M)
     :param n_target_augmentations: Augmentations of each next observation, whose targets are averaged (DrQ's K)

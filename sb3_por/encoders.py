@@ -131,10 +131,11 @@ class SpatialSoftmax(nn.Module):
         :return: Means of x (to the right) and y (down), in [-1, 1], variances of x and y, and covariance, each of all maps,
             shape ``(batch, 5 * n_maps)``
         """
-        # Pixels before maps, as channels-last memory has them
-        pixels = maps.permute(0, 2, 3, 1).flatten(1, 2)
-        shares = (pixels * th.exp(-self.log_temperature)).softmax(dim=1)
-        x, y, xx, yy, xy = (self.monomials @ shares).unbind(dim=1)
+        # Pixels before maps, as channels-last memory has them; in lower precision a variance would be lost in its difference
+        pixels = maps.permute(0, 2, 3, 1).flatten(1, 2).float()
+        with th.autocast(maps.device.type, enabled=False):
+            shares = (pixels * th.exp(-self.log_temperature)).softmax(dim=1)
+            x, y, xx, yy, xy = (self.monomials @ shares).unbind(dim=1)
         return th.cat([x, y, xx - x * x, yy - y * y, xy - x * y], dim=1)
 
 

@@ -59,6 +59,13 @@ def test_spatial_softmax_learns_a_temperature_for_each_map():
     assert gradient[0] != 0 and gradient[1] == 0
 
 
+def test_spatial_softmax_keeps_its_precision_under_autocast():
+    softmax, maps = SpatialSoftmax(2, 8, 8), 20 * th.randn(3, 2, 8, 8)
+    expected = softmax(maps)
+    with th.autocast("cpu", th.bfloat16):
+        assert th.equal(softmax(maps), expected)
+
+
 def test_an_encoder_with_spatial_softmax_gives_positions_unprojected():
     encoder = ConvEncoder(SPACE, n_filters=4, strides=(2, 2), spatial_softmax=True)
     assert encoder.features_dim == 20

@@ -1,11 +1,8 @@
 """The training step that the visual algorithms share: critic and objective train the encoder, then the actor follows."""
 
-import io
-import pathlib
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
@@ -20,16 +17,11 @@ from sb3_por.objectives.base import Objective
 from sb3_por.overlap import OverlappedEnv
 from sb3_por.preparation import Preparation
 from sb3_por.replay import SequenceReplayBuffer
-from sb3_por.rng import get_rng_state, set_rng_state
+from sb3_por.rng import SavedRandomness
 from sb3_por.views import Views
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm as Algorithm
-else:
-    Algorithm = ABC
 
-
-class VisualActorCritic(Algorithm):
+class VisualActorCritic(SavedRandomness, ABC):
     """
     A mixin for SB3's off-policy actor-critics (SAC, TQC). It takes their arguments, in their order, and the keyword
     arguments below; ``VisualSAC`` documents all of them.
@@ -116,7 +108,6 @@ class VisualActorCritic(Algorithm):
         self.diagnostics_interval = diagnostics_interval
         self.overlap = overlap
         self._defer, self._updates_due = False, 0
-        self.rng_state: dict[str, Any] | None = None
         self._metrics = Means()
         kwargs["target_update_interval"] = target_update_interval
         super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, *args, **kwargs)
@@ -148,9 +139,7 @@ class VisualActorCritic(Algorithm):
             if issubclass(self.replay_buffer_class, SequenceReplayBuffer):
                 # SB3 knows its own buffers only
                 warnings.filterwarnings("ignore", message="`n_steps=")
-            rng_state = self.rng_state  # a loaded model's; the seed that SB3 sets here is that of its first start
             super()._setup_model()
-            self.rng_state = rng_state
         if isinstance(self.replay_buffer, SequenceReplayBuffer):
             # Set, it would make SB3 end the episode that a second learn() cuts off
             self.optimize_memory_usage = False
@@ -447,56 +436,6 @@ class VisualActorCritic(Algorithm):
         super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
         self._train_due()
         return self
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> Any:
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        if self.rng_state is not None and not reset_num_timesteps:
-            set_rng_state(self.rng_state, self.action_space)
-        self.rng_state = None
-        return result
-
-    def set_random_seed(self, seed: int | None = None) -> None:
-        """
-        :param seed: Seed of the random generators; what a loaded model brought of theirs is forgotten
-        """
-        super().set_random_seed(seed)
-        self.rng_state = None
-
-    @classmethod
-    def load(cls, *args: Any, **kwargs: Any) -> Any:
-        """See SB3. A model that is given a ``seed`` does not go on with the random numbers of the saved one."""
-        model = super().load(*args, **kwargs)
-        if "seed" in kwargs:
-            model.rng_state = None
-        return model
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        Save all attributes, networks, optimizers and the states of the random generators in a zip file. A loaded model
-        that goes on with ``learn(reset_num_timesteps=False)`` takes up these states.
-
-        :param path: Path to the file
-        :param exclude: Names of attributes to leave out
-        :param include: Names of attributes to save although they are left out by default
-        """
-        loaded = self.rng_state  # of a model that was loaded and has not learned since
-        self.rng_state = loaded or get_rng_state(self.action_space)
-        try:
-            super().save(path, exclude, include)
-        finally:
-            self.rng_state = loaded
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()

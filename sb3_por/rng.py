@@ -1,11 +1,20 @@
 """States of the global random generators, so that a loaded model can go on as if it had never stopped."""
 
+import io
+import pathlib
 import random
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm as Algorithm
+else:
+    Algorithm = object
 
 
 def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
@@ -33,3 +42,68 @@ def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
     if th.cuda.is_available() and len(state["cuda"]) == th.cuda.device_count():
         th.cuda.set_rng_state_all([th.from_numpy(one) for one in state["cuda"]])
     action_space.np_random.bit_generator.state = state["action_space"]
+
+
+class SavedRandomness(Algorithm):
+    """
+    A mixin for SB3's algorithms, which saves the states of the random generators with the model. A loaded model that goes on
+    with ``learn(reset_num_timesteps=False)`` takes them up.
+    """
+
+    #: What a loaded model brought and has not taken up yet.
+    rng_state: dict[str, Any] | None = None
+
+    def _setup_model(self) -> None:
+        rng_state = self.rng_state  # a loaded model's; the seed that SB3 sets here is that of its first start
+        super()._setup_model()
+        self.rng_state = rng_state
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> Any:
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self.rng_state is not None and not reset_num_timesteps:
+            set_rng_state(self.rng_state, self.action_space)
+        self.rng_state = None
+        return result
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        :param seed: Seed of the random generators; what a loaded model brought of theirs is forgotten
+        """
+        super().set_random_seed(seed)
+        self.rng_state = None
+
+    @classmethod
+    def load(cls, *args: Any, **kwargs: Any) -> Any:
+        """See SB3. A model that is given a ``seed`` does not go on with the random numbers of the saved one."""
+        model = super().load(*args, **kwargs)
+        if "seed" in kwargs:
+            model.rng_state = None
+        return model
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all attributes, networks, optimizers and the states of the random generators in a zip file. A loaded model
+        that goes on with ``learn(reset_num_timesteps=False)`` takes up these states.
+
+        :param path: Path to the file
+        :param exclude: Names of attributes to leave out
+        :param include: Names of attributes to save although they are left out by default
+        """
+        loaded = self.rng_state  # of a model that was loaded and has not learned since
+        self.rng_state = loaded or get_rng_state(self.action_space)
+        try:
+            super().save(path, exclude, include)
+        finally:
+            self.rng_state = loaded

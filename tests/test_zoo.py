@@ -101,7 +101,7 @@ def test_a_run_that_begins_with_a_model_has_a_seed_of_its_own(tmp_path, monkeypa
     model = ALGORITHMS["sac_por"]("MlpPolicy", "Pendulum-v1", buffer_size=100, learning_starts=10, batch_size=8)
     model.learn(20).save(tmp_path / "model.zip")
     restored = []
-    monkeypatch.setattr("sb3_por.actor_critic.set_rng_state", lambda *state: restored.append(state))
+    monkeypatch.setattr("sb3_por.rng.set_rng_state", lambda *state: restored.append(state))
     flags = ["-n", "10", "--eval-freq", "-1", "--env", "Pendulum-v1", "-i", str(tmp_path / "model.zip"), "-f", str(tmp_path)]
     assert main(["--algo", "sac_por", *flags, "-params", "policy:MlpPolicy", "learning_starts:10", "batch_size:8"]) == 0
     assert restored == []

@@ -334,8 +334,6 @@ class Experiment(ExperimentManager):
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
             env.seed((self.seed + model.num_timesteps) % 2**32)
-        else:
-            model.rng_state = None  # type: ignore[attr-defined]  # of another run: this one has a seed of its own
         return model
 
     def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> dict[str, Any]:

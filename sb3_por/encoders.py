@@ -101,40 +101,50 @@ class CenteredConv2d(nn.Conv2d):
         return self._conv_forward(images, self.weight, offset)
 
 
+def _from_middle(n: int) -> th.Tensor:
+    """Places of ``n`` pixels in a row."""
+    return th.arange(n) - (n - 1) / 2
+
+
 class SpatialSoftmax(nn.Module):
     """
     Where each map is large: mean and covariance of the position under a softmax over its pixels, with a learned temperature a
     map. Means are the feature points of https://arxiv.org/abs/1504.00702; two things that look the same have one mean,
-    and their distance and direction are in the covariance.
+    and their distance and direction are in the covariance. The temperature is in units of the map's standard deviation over
+    its pixels: however weak a filter's response is, the positions vary with what it sees.
 
     :param n_maps: Number of maps
     :param height: Of a map, pixels
     :param width: Of a map, pixels
-    :param temperature: What the maps are divided by at first
+    :param temperature: At first; standard deviations of a map
     """
 
     #: Features of one map
     N_MOMENTS: ClassVar[int] = 5
+    #: Maps that vary less are not enlarged further
+    MIN_DEVIATION: ClassVar[float] = 1e-3
 
     monomials: th.Tensor
 
-    def __init__(self, n_maps: int, height: int, width: int, temperature: float = 0.25):
+    def __init__(self, n_maps: int, height: int, width: int, temperature: float = 1.0):
         super().__init__()
         self.log_temperature = nn.Parameter(th.full((n_maps,), math.log(temperature)))
-        rows, columns = th.meshgrid(th.linspace(-1, 1, height), th.linspace(-1, 1, width), indexing="ij")
+        rows, columns = th.meshgrid(_from_middle(height), _from_middle(width), indexing="ij")
         x, y = columns.flatten(), rows.flatten()
         self.register_buffer("monomials", th.stack([x, y, x * x, y * y, x * y]), persistent=False)
 
     def forward(self, maps: th.Tensor) -> th.Tensor:
         """
         :param maps: Shape ``(batch, n_maps, height, width)``
-        :return: Means of x (to the right) and y (down), in [-1, 1], variances of x and y, and covariance, each of all maps,
-            shape ``(batch, 5 * n_maps)``
+        :return: Means of x (to the right) and y (down), from the middle and in pixels of the maps, variances of x and y, and
+            covariance, each of all maps, shape ``(batch, 5 * n_maps)``
         """
         # Pixels before maps, as channels-last memory has them; in lower precision a variance would be lost in its difference
         pixels = maps.permute(0, 2, 3, 1).flatten(1, 2).float()
         with th.autocast(maps.device.type, enabled=False):
-            shares = (pixels * th.exp(-self.log_temperature)).softmax(dim=1)
+            # A softmax does not see the mean; a map without any variation has no place, and its shares are equal
+            variance = pixels.var(dim=1, keepdim=True, correction=0) + self.MIN_DEVIATION**2
+            shares = (pixels * (variance.rsqrt() * th.exp(-self.log_temperature))).softmax(dim=1)
             x, y, xx, yy, xy = (self.monomials @ shares).unbind(dim=1)
         return th.cat([x, y, xx - x * x, yy - y * y, xy - x * y], dim=1)
 

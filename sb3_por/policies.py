@@ -90,15 +90,36 @@ else:
     Policy = object
 
 
+def with_layer_norm(network: nn.Sequential) -> nn.Sequential:
+    """
+    :param network: Linear layers with activations between them
+    :return: The same with a layer norm between each hidden linear layer and its activation
+    """
+    layers: list[nn.Module] = []
+    for layer in network:
+        layers.append(layer)
+        if isinstance(layer, nn.Linear) and layer is not network[-1]:
+            layers.append(nn.LayerNorm(layer.out_features))
+    return nn.Sequential(*layers)
+
+
 class EncoderOwner:
     """
     A critic that owns an encoder: trunk (``features_extractor``) and ``projection`` together are f_o, and in the target
     critic f_m. A mixin for SB3's critics.
+
+    :param layer_norm: The Q networks have layer norm
     """
 
-    def __init__(self, *args: Any, **kwargs: Any):
+    q_networks: list[Any]
+
+    def __init__(self, *args: Any, layer_norm: bool = False, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.projection = make_projection(self.features_extractor)  # type: ignore[attr-defined]
+        if layer_norm:
+            self.q_networks = [with_layer_norm(network) for network in self.q_networks]
+            for index, network in enumerate(self.q_networks):
+                setattr(self, f"qf{index}", network)
 
     def trunk(self, observations: PyTorchObs) -> th.Tensor:
         """
@@ -125,7 +146,7 @@ class EncoderOwner:
         """
         :return: Parameters of the Q networks
         """
-        return [parameter for head in self.q_networks for parameter in head.parameters()]  # type: ignore[attr-defined]
+        return [parameter for head in self.q_networks for parameter in head.parameters()]
 
 
 class VisualCritic(EncoderOwner, ContinuousCritic):
@@ -172,6 +193,8 @@ class VisualPolicy(Policy):
 
     :param share_features_extractor: The actor uses the critic's trunk, detached (default). Otherwise it has a trunk of
         its own, trained by its loss
+    :param critic_layer_norm: The Q networks have layer norm, so that their hidden units stay alive and values of actions that
+        were never taken stay bounded (https://arxiv.org/abs/2302.02948)
     :param objective_class: Auxiliary objective, trained together with the critic; None for none
     :param objective_kwargs: Keyword arguments of the objective
     """
@@ -193,6 +216,7 @@ class VisualPolicy(Policy):
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
         share_features_extractor: bool = True,
+        critic_layer_norm: bool = False,
         objective_class: type[Objective] | None = None,
         objective_kwargs: dict[str, Any] | None = None,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -208,6 +232,7 @@ class VisualPolicy(Policy):
         if not normalize_images and issubclass(features_extractor_class, (ConvEncoder, CombinedEncoder)):
             # As SB3 does for its own extractors: no check of type and bounds
             features_extractor_kwargs["normalized_image"] = True
+        self.critic_layer_norm = critic_layer_norm
         self.objective_class = objective_class
         self.objective_kwargs = objective_kwargs or {}
         super().__init__(
@@ -256,13 +281,15 @@ class VisualPolicy(Policy):
         return VisualActor(**actor_kwargs, detach_trunk=features_extractor is not None).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        return self.critic_class(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
+        critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return self.critic_class(**critic_kwargs, layer_norm=self.critic_layer_norm).to(self.device)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         # SB3 forgets share_features_extractor
         return dict(
             super()._get_constructor_parameters(),
             share_features_extractor=self.share_features_extractor,
+            critic_layer_norm=self.critic_layer_norm,
             objective_class=self.objective_class,
             objective_kwargs=self.objective_kwargs,
         )

@@ -1,5 +1,7 @@
 """What the encoders do to images."""
 
+import math
+
 import numpy as np
 import pytest
 import torch as th
@@ -40,20 +42,35 @@ def test_center_subtracts_one_half_once_and_only_from_images_in_0_1(center, norm
 
 
 def test_spatial_softmax_tells_mean_and_covariance_of_where_a_map_is_large():
-    softmax = SpatialSoftmax(2, 3, 5)
-    maps = th.full((1, 2, 3, 5), -100.0)
-    maps[0, 0, 0, 3] = 0.0  # one peak: above, to the right
-    maps[0, 1, 0, 0] = maps[0, 1, 2, 4] = 0.0  # two: above to the left, below to the right
+    softmax = SpatialSoftmax(2, 3, 5, temperature=0.01)
+    maps = th.zeros(1, 2, 3, 5)
+    maps[0, 0, 0, 3] = 1.0  # one peak: above, to the right
+    maps[0, 1, 0, 0] = maps[0, 1, 2, 4] = 1.0  # two: above to the left, below to the right
     features = softmax(maps).reshape(5, 2)
-    th.testing.assert_close(features[:, 0], th.tensor([0.5, -1.0, 0.0, 0.0, 0.0]))
-    th.testing.assert_close(features[:, 1], th.tensor([0.0, 0.0, 1.0, 1.0, 1.0]))
+    th.testing.assert_close(features[:, 0], th.tensor([1.0, -1.0, 0.0, 0.0, 0.0]))
+    th.testing.assert_close(features[:, 1], th.tensor([0.0, 0.0, 4.0, 1.0, 2.0]))
+
+
+def test_spatial_softmax_sees_weak_maps_as_strong_ones():
+    softmax, maps = SpatialSoftmax(2, 8, 8), th.randn(20, 2, 8, 8)
+    th.testing.assert_close(softmax(0.05 * maps + 3.0), softmax(maps), atol=1e-2, rtol=1e-2)
+    assert softmax(maps)[:, :4].std(dim=0).min() > 0.1  # pixels
+
+
+def test_spatial_softmax_puts_what_a_flat_map_shows_in_the_middle():
+    maps = th.full((1, 1, 3, 5), 0.7, requires_grad=True)
+    features = SpatialSoftmax(1, 3, 5)(maps)
+    th.testing.assert_close(features[0], th.tensor([0.0, 0.0, 2.0, 2 / 3, 0.0]))
+    features.sum().backward()
+    assert maps.grad.isfinite().all()
 
 
 def test_spatial_softmax_learns_a_temperature_for_each_map():
-    softmax = SpatialSoftmax(2, 4, 4, temperature=0.5)
-    maps = th.randn(3, 2, 4, 4)
-    sharper = SpatialSoftmax(2, 4, 4, temperature=0.25)
-    th.testing.assert_close(softmax(2 * maps), sharper(maps))
+    softmax, maps = SpatialSoftmax(2, 4, 4, temperature=0.5), th.randn(3, 2, 4, 4)
+    with th.no_grad():
+        softmax.log_temperature[1] = math.log(0.02)
+    spread = softmax(maps).reshape(3, 5, 2)[:, 2:4].sum(dim=(0, 1))
+    assert spread[1] < 0.5 * spread[0]
     softmax(maps)[:, 0].sum().backward()  # x of the first map
     gradient = softmax.log_temperature.grad
     assert gradient[0] != 0 and gradient[1] == 0

@@ -21,11 +21,11 @@ def make_env(envs=None):
     return VecTransposeImage(DummyVecEnv([lambda env=env: env for env in envs]))
 
 
-def make_model(cls, env, **kwargs):
+def make_model(cls, env, policy_kwargs=POLICY, **kwargs):
     return cls(
         "CnnPolicy",
         env,
-        policy_kwargs=POLICY,
+        policy_kwargs=policy_kwargs,
         buffer_size=200,
         learning_starts=50,
         train_freq=2,
@@ -132,7 +132,8 @@ def test_loaded_model_predicts_identically(tmp_path):
 
 
 def test_policy_alone_saves_and_loads_with_its_objective(tmp_path):
-    model = make_model(SACPOR, make_env(), order_head="difference").learn(30)
+    policy_kwargs = dict(POLICY, critic_layer_norm=True)
+    model = make_model(SACPOR, make_env(), policy_kwargs, order_head="difference").learn(30)
     model.policy.save(tmp_path / "policy.pth")
     loaded = type(model.policy).load(tmp_path / "policy.pth", device="cpu")
     for (name, one), other in zip(model.policy.state_dict().items(), loaded.state_dict().values(), strict=True):

@@ -176,19 +176,40 @@ def test_a_reward_for_ever_needs_a_discount():
         make_model(gamma=1.0, start_at_mean_reward=True)
 
 
-def test_hidden_units_stay_between_always_and_never_where_values_start_at_the_mean_reward():
-    def share_of_switching_units(start):
-        env = TransformReward(DotEnv(), lambda reward: 20 * (reward - 10.0))
-        model = make_model(env=env, n_collected=100, gamma=0.95, start_at_mean_reward=start, learning_rate=1e-3)
-        model.train(200, 8)
-        data = model._sample(200)
-        with th.no_grad():
-            hidden = th.cat([model.critic.encode(data.observations), data.actions], dim=1)
-            hidden = model.critic.q_networks[0][:-1](hidden)
-        active = (hidden > 0).float().mean(dim=0)
-        return ((active > 0) & (active < 1)).float().mean().item()
+def share_of_switching_units(**kwargs):
+    """Of the last hidden layer, where rewards are far below 0."""
+    env = TransformReward(DotEnv(), lambda reward: 20 * (reward - 10.0))
+    model = make_model(env=env, n_collected=100, gamma=0.95, learning_rate=1e-3, **kwargs)
+    model.train(200, 8)
+    data = model._sample(200)
+    with th.no_grad():
+        hidden = th.cat([model.critic.encode(data.observations), data.actions], dim=1)
+        hidden = model.critic.q_networks[0][:-1](hidden)
+    active = (hidden > 0).float().mean(dim=0)
+    return ((active > 0) & (active < 1)).float().mean().item()
 
-    assert share_of_switching_units(True) > share_of_switching_units(False) + 0.2
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_hidden_units_stay_between_always_and_never_where_values_start_at_the_mean_reward(layer_norm):
+    policy_kwargs = dict(POLICY, critic_layer_norm=layer_norm)
+    started = share_of_switching_units(policy_kwargs=policy_kwargs, start_at_mean_reward=True)
+    assert started > share_of_switching_units(policy_kwargs=policy_kwargs) + 0.2
+
+
+@pytest.mark.parametrize("cls", [VisualSAC, TQCPOR])
+def test_layer_norm_of_the_critics_is_trained_and_follows(cls):
+    model = make_model(cls, policy_kwargs=dict(POLICY, critic_layer_norm=True))
+    names = [name for name, _ in model.critic.named_parameters() if name.startswith("qf")]
+    assert names == [name for name, _ in model.critic_target.named_parameters() if name.startswith("qf")]
+    for critic in (model.critic, model.critic_target):
+        for index, head in enumerate(critic.q_networks):
+            kinds = [type(layer).__name__ for layer in head]
+            assert kinds == ["Linear", "LayerNorm", "ReLU"] * (len(kinds) // 3) + ["Linear"]
+            assert getattr(critic, f"qf{index}") is head
+    before = snapshot(model.critic.head_parameters()), snapshot(model.critic_target.head_parameters())
+    model.train(2, 8)
+    for old, new in zip(before, (model.critic.head_parameters(), model.critic_target.head_parameters()), strict=True):
+        assert all(not th.equal(*pair) for pair in zip(old, new, strict=True))
 
 
 def test_k_and_m_augmentations_are_averaged():

@@ -3,15 +3,18 @@ How soon does an encoder see where things are? Trains encoders, by regression, t
 second picker and both ends are, seen from the first picker, and how high both pickers are.
 
     python benchmarks/encoders.py [--json]         about five minutes
+    python benchmarks/encoders.py MODEL.zip ...    what agents' encoders have learned by their own loss
 
 `error_cm` is the root mean square error along x and y in scenes that were not trained on, `height_cm` that of the heights;
 `constant` is what the mean of the training data would give. A picker takes an end within 5 cm. Images are shifted at random
-as in training.
+as in training. Of an agent's encoder the features are taken as they are, and a head learns from them.
 """
 
 import argparse
 import json
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -23,9 +26,13 @@ from torch import nn
 import softbody_envs  # noqa: F401  registers the tasks
 from sb3_por.augmentations import RandomShift
 from sb3_por.encoders import ConvEncoder
+from sb3_por.loading import load_model
 from softbody_envs.experts import make_expert
 from softbody_envs.sim.pickers import REACH
 from softbody_envs.variations import SPLITS
+
+#: Images and targets
+Frames = tuple[th.Tensor, th.Tensor]
 
 ENV = "StraightenRope-v0"
 STEPS = 40
@@ -71,32 +78,68 @@ def collect(split: str, scenes: int, image_size: int, rng: np.random.Generator) 
     return th.as_tensor(np.array(images)).permute(0, 3, 1, 2).contiguous(), th.as_tensor(np.array(targets)).float()
 
 
-def train(
-    options: dict[str, Any], data: tuple[th.Tensor, th.Tensor], held_out: tuple[th.Tensor, th.Tensor], updates: int, batch: int
-) -> dict[str, float]:
+def make_head(n_features: int, n_targets: int) -> nn.Sequential:
+    """An MLP as large as a critic."""
+    hidden = (nn.Linear(n_features, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU())
+    return nn.Sequential(*hidden, nn.Linear(256, n_targets))
+
+
+def fit(
+    network: nn.Module, inputs: th.Tensor, targets: th.Tensor, prepare: Callable[[th.Tensor], th.Tensor], arguments: Any
+) -> float:
     """
-    :return: errors on the held-out frames and seconds of training
+    :return: seconds
     """
-    th.manual_seed(0)
-    (images, targets), (new_images, new_targets) = data, held_out
-    encoder = ConvEncoder(spaces.Box(0, 255, images.shape[1:], np.uint8), **options)
-    head = nn.Sequential(
-        nn.Linear(encoder.features_dim, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, targets.shape[1])
-    )
-    network = nn.Sequential(encoder, encoder.make_projection(), head)
     optimizer = th.optim.Adam(network.parameters(), lr=7e-4, fused=True)
-    augment = RandomShift()
     before = time.perf_counter()
-    for _ in range(updates):
-        rows = th.randint(0, len(images), (batch,))
-        loss = nn.functional.mse_loss(network(augment(images[rows]).float() / 255), targets[rows])
+    for _ in range(arguments.updates):
+        rows = th.randint(0, len(inputs), (arguments.batch,))
+        loss = nn.functional.mse_loss(network(prepare(inputs[rows])), targets[rows])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    seconds = time.perf_counter() - before
+    return round(time.perf_counter() - before, 1)
+
+
+def in_parts(network: Callable[[th.Tensor], th.Tensor], images: th.Tensor) -> th.Tensor:
+    """What a network says of images, without gradient."""
     with th.no_grad():
-        outputs = th.cat([network(part.float() / 255) for part in new_images.split(500)])
-    return {"seconds": round(seconds, 1), **errors(outputs, new_targets)}
+        return th.cat([network(part) for part in images.split(500)])
+
+
+def train(options: dict[str, Any], data: Frames, held_out: Frames, arguments: Any) -> dict[str, float]:
+    """
+    Train an encoder by the targets alone.
+
+    :return: errors on the held-out frames and seconds of training
+    """
+    th.manual_seed(0)
+    encoder = ConvEncoder(spaces.Box(0, 255, data[0].shape[1:], np.uint8), **options)
+    network = nn.Sequential(encoder, encoder.make_projection(), make_head(encoder.features_dim, data[1].shape[1]))
+    augment = RandomShift()
+    seconds = fit(network, *data, lambda images: augment(images).float() / 255, arguments)
+    outputs = in_parts(lambda images: network(images.float() / 255), held_out[0])
+    return {"seconds": seconds, **errors(outputs, held_out[1])}
+
+
+def probe(model: Path, data: Frames, held_out: Frames, arguments: Any) -> dict[str, float]:
+    """
+    Train nothing but a head, on the features of an agent's encoder (standardized).
+
+    :return: errors on the held-out frames and seconds of training
+    """
+    encode = load_model(model, device="cpu").critic.encode
+    features = in_parts(encode, data[0])
+    deviation, mean = th.std_mean(features, dim=0)
+
+    def standardize(features: th.Tensor) -> th.Tensor:
+        return (features - mean) / (deviation + 1e-4)
+
+    th.manual_seed(0)
+    head = make_head(features.shape[1], data[1].shape[1])
+    seconds = fit(head, features, data[1], standardize, arguments)
+    outputs = in_parts(lambda images: head(standardize(encode(images))), held_out[0])
+    return {"seconds": seconds, **errors(outputs, held_out[1])}
 
 
 def errors(outputs: th.Tensor, targets: th.Tensor) -> dict[str, float]:
@@ -109,6 +152,7 @@ def errors(outputs: th.Tensor, targets: th.Tensor) -> dict[str, float]:
 def main() -> None:
     """Do what the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="*", type=Path, metavar="MODEL.zip", help="agents whose encoders are probed instead")
     parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
     parser.add_argument("--image-size", type=int, default=64, help="pixels")
     parser.add_argument("--batch", type=int, default=64, help="frames per update")
@@ -120,8 +164,10 @@ def main() -> None:
     data = collect("train", arguments.scenes, arguments.image_size, rng)
     held_out = collect("eval", max(1, arguments.scenes // 10), arguments.image_size, rng)
     rows: list[dict[str, Any]] = [{"encoder": "constant", "seconds": 0.0, **errors(data[1].mean(0), held_out[1])}]
-    for name, options in ENCODERS.items():
-        rows.append({"encoder": name, **train(options, data, held_out, arguments.updates, arguments.batch)})
+    for name, options in ENCODERS.items() if not arguments.models else ():
+        rows.append({"encoder": name, **train(options, data, held_out, arguments)})
+    for model in arguments.models:
+        rows.append({"encoder": str(model), **probe(model, data, held_out, arguments)})
     lines = [f"{row['encoder']:28s}{row['error_cm']:6.1f} cm{row['height_cm']:6.1f} cm{row['seconds']:8.1f} s" for row in rows]
     print(json.dumps(rows, indent=1) if arguments.json else "\n".join(lines))
 

@@ -85,7 +85,11 @@ def make_head(n_features: int, n_targets: int) -> nn.Sequential:
 
 
 def fit(
-    network: nn.Module, inputs: th.Tensor, targets: th.Tensor, prepare: Callable[[th.Tensor], th.Tensor], arguments: Any
+    network: nn.Module,
+    inputs: th.Tensor,
+    targets: th.Tensor,
+    prepare: Callable[[th.Tensor], th.Tensor],
+    arguments: argparse.Namespace,
 ) -> float:
     """
     :return: seconds
@@ -107,7 +111,7 @@ def in_parts(network: Callable[[th.Tensor], th.Tensor], images: th.Tensor) -> th
         return th.cat([network(part) for part in images.split(500)])
 
 
-def train(options: dict[str, Any], data: Frames, held_out: Frames, arguments: Any) -> dict[str, float]:
+def train(options: dict[str, Any], data: Frames, held_out: Frames, arguments: argparse.Namespace) -> dict[str, float]:
     """
     Train an encoder by the targets alone.
 
@@ -122,7 +126,7 @@ def train(options: dict[str, Any], data: Frames, held_out: Frames, arguments: An
     return {"seconds": seconds, **errors(outputs, held_out[1])}
 
 
-def probe(model: Path, data: Frames, held_out: Frames, arguments: Any) -> dict[str, float]:
+def probe(model: Path, data: Frames, held_out: Frames, arguments: argparse.Namespace) -> dict[str, float]:
     """
     Train nothing but a head, on the features of an agent's encoder (standardized).
 

@@ -1,9 +1,10 @@
 """
-How soon does an encoder see where things are? Trains encoders, by regression, to tell from an image of the rope where the
-second picker and both ends are, seen from the first picker, and how high both pickers are.
+How soon does an encoder see where things are? Trains encoders, by regression, to tell from an image where the second picker
+is, seen from the first, how high both are, and where the ends of the rope are or, seen from its picker, each corner to take.
 
-    python benchmarks/encoders.py [--json]         about five minutes
-    python benchmarks/encoders.py MODEL.zip ...    what agents' encoders have learned by their own loss
+    python benchmarks/encoders.py [--json]             about five minutes
+    python benchmarks/encoders.py --env FoldCloth-v0   of the cloth instead of the rope
+    python benchmarks/encoders.py MODEL.zip ...        what agents' encoders have learned by their own loss
 
 `error_cm` is the root mean square error along x and y in scenes that were not trained on, `height_cm` that of the heights;
 `constant` is what the mean of the training data would give. A picker takes an end within 5 cm. Images are shifted at random
@@ -34,7 +35,6 @@ from softbody_envs.variations import SPLITS
 #: Images and targets
 Frames = tuple[th.Tensor, th.Tensor]
 
-ENV = "StraightenRope-v0"
 STEPS = 40
 #: Targets along x and y; those after them are heights.
 N_FLAT = 6
@@ -47,7 +47,7 @@ ENCODERS: dict[str, dict[str, Any]] = {
 }
 
 
-def ways(state: np.ndarray) -> np.ndarray:
+def ways_on_rope(state: np.ndarray) -> np.ndarray:
     """
     From picker 0 to the end that is nearer to it, to the other end, and to picker 1: x and y. Then the heights of picker 0 and
     1. In 0.08 m, ``(8,)``.
@@ -56,10 +56,21 @@ def ways(state: np.ndarray) -> np.ndarray:
     return np.concatenate([first[:2], second[:2], (state[33:35] - state[30:32]) / REACH, state[[32, 35]] / REACH])
 
 
-def collect(split: str, scenes: int, image_size: int, rng: np.random.Generator) -> tuple[th.Tensor, th.Tensor]:
+def ways_on_cloth(state: np.ndarray) -> np.ndarray:
+    """
+    From each picker to the corner that it starts nearer to, and from picker 0 to picker 1: x and y. Then the heights of picker
+    0 and 1. In 0.08 m, ``(8,)``.
+    """
+    return np.concatenate([state[20:22], state[23:25], (state[15:17] - state[12:14]) / REACH, state[[14, 17]] / REACH])
+
+
+WAYS = {"StraightenRope-v0": ways_on_rope, "FoldCloth-v0": ways_on_cloth}
+
+
+def collect(env_id: str, split: str, scenes: int, image_size: int, rng: np.random.Generator) -> tuple[th.Tensor, th.Tensor]:
     """Every second frame of play that is partly random, partly the expert's, and where things are in it."""
-    env = gym.make(ENV, obs_type="dict", image_size=image_size, split=split)
-    expert = make_expert(ENV)
+    env = gym.make(env_id, obs_type="dict", image_size=image_size, split=split)
+    expert, ways = make_expert(env_id), WAYS[env_id]
     images, targets = [], []
     for variation in list(SPLITS[split])[:scenes]:
         observation, _ = env.reset(options={"variation": variation})
@@ -157,6 +168,7 @@ def main() -> None:
     """Do what the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="*", type=Path, metavar="MODEL.zip", help="agents whose encoders are probed instead")
+    parser.add_argument("--env", choices=WAYS, default="StraightenRope-v0", help="environment id")
     parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
     parser.add_argument("--image-size", type=int, default=64, help="pixels")
     parser.add_argument("--batch", type=int, default=64, help="frames per update")
@@ -165,8 +177,8 @@ def main() -> None:
     arguments = parser.parse_args()
     th.set_num_threads(1)
     rng = np.random.default_rng(0)
-    data = collect("train", arguments.scenes, arguments.image_size, rng)
-    held_out = collect("eval", max(1, arguments.scenes // 10), arguments.image_size, rng)
+    data = collect(arguments.env, "train", arguments.scenes, arguments.image_size, rng)
+    held_out = collect(arguments.env, "eval", max(1, arguments.scenes // 10), arguments.image_size, rng)
     rows: list[dict[str, Any]] = [{"encoder": "constant", "seconds": 0.0, **errors(data[1].mean(0), held_out[1])}]
     for name, options in ENCODERS.items() if not arguments.models else ():
         rows.append({"encoder": name, **train(options, data, held_out, arguments)})

@@ -28,6 +28,8 @@ def paint_sheet(
     grid: np.ndarray,
     face: tuple[float, float, float],
     underside: tuple[float, float, float],
+    centers: np.ndarray,
+    radius: float,
 ) -> None:
     """
     Bullet never updates the normals of a cloth, so a renderer shows no fold of it (bullet3 6c888f4ab).
@@ -40,6 +42,8 @@ def paint_sheet(
     :param grid: nodes of the sheet, m, ``(rows, columns, 3)``
     :param face: colour of the side from which columns follow rows counterclockwise, RGB in [0, 1]
     :param underside: colour of the other side
+    :param centers: of spheres that cast shadows on it, m, ``(n, 3)``
+    :param radius: of the spheres, m
     """
     size = len(frame)
     points, normals = _surface(grid, camera, size)
@@ -57,9 +61,17 @@ def paint_sheet(
     is_face, normals = is_face[farthest_first], normals[farthest_first]
     lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)  # of a crease
     facing_light = (normals @ LIGHT) * np.where(is_face, 1, -1) / lengths
-    brightness = AMBIENT + (1 - AMBIENT) * np.clip(facing_light, 0, 1)
+    lit = np.clip(facing_light, 0, 1) * ~_shaded(points[farthest_first], centers, radius)
+    brightness = AMBIENT + (1 - AMBIENT) * lit
     colors = np.where(is_face[:, None], face, underside) * brightness[:, None]
     frame.reshape(-1, 3)[pixel[farthest_first]] = np.round(255 * colors)
+
+
+def _shaded(points: np.ndarray, centers: np.ndarray, radius: float) -> np.ndarray:
+    """Which points a sphere between them and the light shades, ``(n,)``."""
+    ways = centers[:, None] - points
+    across = ((ways @ ACROSS_LIGHT) ** 2).sum(axis=-1) < radius**2
+    return (across & (ways @ LIGHT > 0)).any(axis=0)
 
 
 def paint_shadows(

@@ -317,3 +317,23 @@ def test_mesh_has_every_node_and_only_short_edges():
     assert lengths.max() <= np.hypot(0.4, 0.5) / (N_SIDE - 1) + 1e-9
     for corner in (0, N_SIDE - 1, N_SIDE * (N_SIDE - 1), N_SIDE**2 - 1):
         assert (edges == corner).sum() == 3, "each corner hangs on a diagonal, too"
+
+
+def test_the_image_tells_how_high_a_picker_is():
+    env = gym.make("FoldCloth-v0", obs_type="pixels", image_size=84).unwrapped
+    env.reset(options={"variation": 0})
+    up = np.array([0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 1.0, -1.0])
+    env.step(up)
+
+    def on_cloth():
+        red, green, blue = env._image(84).astype(int).transpose(2, 0, 1)
+        dark = (red > 2 * green) & (blue > green) & (red < 150)  # the shaded face
+        return np.argwhere(dark).mean(axis=0) if dark.any() else None
+
+    places = []
+    for _ in range(3):
+        env.step(up)
+        places.append(on_cloth())
+    env.close()
+    assert all(place is not None for place in places)
+    assert min(np.linalg.norm(np.diff(places, axis=0), axis=1)) > 1

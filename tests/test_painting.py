@@ -13,11 +13,12 @@ SIZES = (64, 84, 128)
 CAMERA = Camera(position=(0.0, -0.82, 0.82), target=(0.0, 0.0, 0.0))
 ABOVE = Camera(position=(0.0, 0.0, 0.93), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 FLOOR = Floor(0.0, half_size=3.0)
+NOWHERE = np.zeros((0, 3))
 
 
-def paint(grid, size=84, camera=CAMERA, depth=1.0):
+def paint(grid, size=84, camera=CAMERA, depth=1.0, centers=NOWHERE):
     frame = np.full((size, size, 3), 200, np.uint8)
-    paint_sheet(frame, np.broadcast_to(np.float32(depth), (size, size)), camera, grid, FACE, UNDERSIDE)
+    paint_sheet(frame, np.broadcast_to(np.float32(depth), (size, size)), camera, grid, FACE, UNDERSIDE, centers, 0.05)
     return frame
 
 
@@ -81,6 +82,28 @@ def test_light_and_shade_tell_slopes_apart():
 def test_a_sheet_may_leave_the_image(shift):
     frame = paint(flat_grid(0.5, 0.5) + np.array(shift))
     assert frame.shape == (84, 84, 3)
+
+
+def shadow_on_sheet(center, slope=0.0):
+    """Where a sphere of 5 cm makes a sheet darker, bool; the sheet rises along y."""
+    grid = flat_grid(0.6, 0.6)
+    grid[..., 2] += slope * grid[..., 1]
+    bare, shaded = (paint(grid, 256, ABOVE, centers=centers) for centers in (NOWHERE, np.array([center])))
+    return (shaded < bare).any(axis=-1)
+
+
+@pytest.mark.parametrize("height", (0.06, 0.12))
+def test_a_shadow_on_a_sheet_is_where_it_would_be_on_the_floor(height):
+    center = (0.05, 0.0, height)
+    on_floor, on_sheet = shadow(center), shadow_on_sheet(center)
+    assert (on_floor & on_sheet).sum() > 0.95 * on_floor.sum()
+    assert on_sheet.sum() < 1.1 * on_floor.sum()
+
+
+def test_a_shadow_follows_the_sheet_and_spares_what_is_above_the_sphere():
+    rows = [np.nonzero(shadow_on_sheet((0.0, 0.0, 0.15), slope))[0].mean() for slope in (0.0, 0.3)]
+    assert rows[1] > rows[0] + 2  # the sheet rises toward it: it falls sooner
+    assert not shadow_on_sheet((0.0, 0.0, -0.15)).any()
 
 
 def shadow(center, radius=0.05, size=256, depth=1.0, floor=FLOOR):

@@ -74,8 +74,12 @@ class World:
         self.floor = Floor(height, half_size=3.0)
         return self.floor
 
-    def add_box_floor(self) -> None:
-        """A thick slab with its top at z = 0, for deformable worlds: on a plane a cloth never settles."""
+    def add_box_floor(self) -> Floor:
+        """
+        A thick slab with its top at z = 0, for deformable worlds: on a plane a cloth never settles.
+
+        :return: ``floor``, as it is now
+        """
         self.floor = Floor(0.0, half_size=5.0)
         box = self.client.createCollisionShape(
             pybullet.GEOM_BOX, halfExtents=(self.floor.half_size, self.floor.half_size, 0.5)
@@ -84,6 +88,7 @@ class World:
         body = self.client.createMultiBody(0, box, basePosition=(0, 0, -0.5), useMaximalCoordinates=True)
         self.client.changeDynamics(body, -1, lateralFriction=1.0)
         self._hide(body)
+        return self.floor
 
     def _hide(self, body: int) -> None:
         """A body without a visual shape would be drawn as it collides."""

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from softbody_envs.painting import paint_sheet
+from softbody_envs.painting import paint_shadows, paint_sheet
 from softbody_envs.rendering import Camera
 from softbody_envs.sim.cloth import N_SIDE, STEPS_PER_CONTROL, Cloth, flat_grid
 from softbody_envs.sim.pickers import REACH, Pickers
@@ -38,7 +38,7 @@ class FoldClothEnv(PickerEnv):
     the cloth and lay it on the edge opposite, so that one half lies on the other and the other has not moved.
 
     The cloth is a mesh of 9 x 9 masses and springs in Bullet's deformable world. Its face is pink, its underside yellow.
-    A picker is a sphere, dark while it holds something.
+    A picker is a sphere, dark while it holds something; the farther its shadow is from it the higher it is.
 
     ## Action Space
 
@@ -106,7 +106,7 @@ class FoldClothEnv(PickerEnv):
     * Pickers do not push the cloth, and they cannot tear it apart (SoftGym has a guard against that, switched off).
     * The state also says which picker holds something, where its corner is from it, and how far the corner has to go, both
       in units of what a picker moves in one step.
-    * The cloth has no stripe of the other colour.
+    * The cloth has no stripe of the other colour, and only the pickers cast shadows.
 
     ## Version History
 
@@ -147,7 +147,7 @@ class FoldClothEnv(PickerEnv):
 
     def _furnish(self, world: World, grid: np.ndarray, pickers: list[tuple[float, float, float]]) -> None:
         """Put a floor, a cloth at rest and two pickers into the world."""
-        world.add_box_floor()
+        self._floor = world.add_box_floor()
         self.cloth = Cloth(world, grid)
         low, high = np.array(self.workspace)
         self.pickers = Pickers(
@@ -189,7 +189,9 @@ class FoldClothEnv(PickerEnv):
 
     def _image(self, size: int) -> np.ndarray:
         frame, depth = self.renderer.render(self.world, self.camera, size)
-        paint_sheet(frame, depth, self.camera, self._grid, FACE, UNDERSIDE)
+        spheres = self.pickers.positions, PICKER_RADIUS
+        paint_shadows(frame, depth, self.camera, self._floor, *spheres)
+        paint_sheet(frame, depth, self.camera, self._grid, FACE, UNDERSIDE, *spheres)
         return frame
 
 

@@ -1,5 +1,5 @@
 """
-Fills in the tables of results.md, full_speed.md and por.md from the tables in results/, and draws their figures.
+Fills in the tables of results.md, full_speed.md, trials.md and por.md from the tables in results/, and draws their figures.
 
     python docs/make_results.py              tables only
     python docs/make_results.py --figures    and the figures
@@ -20,7 +20,7 @@ from sb3_por.scores import read_scores
 
 DOCS = Path(__file__).parent
 RESULTS = DOCS.parent / "results"
-PAGES = ("results.md", "full_speed.md", "por.md")
+PAGES = ("results.md", "full_speed.md", "trials.md", "por.md")
 METRIC = "normalized_performance"
 #: Whom the paper compares POR with, from pixels.
 RIVALS = ("sac_drq", "sac_curl", "sac_spr")

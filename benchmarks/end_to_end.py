@@ -6,7 +6,8 @@ How many environment steps a second training makes, and what environments and le
 
 `env_steps_per_s` is random play in worker processes, `learner_steps_per_s` updates alone (one for each `--steps-per-update`
 environment steps). `ratio` is what training reaches of the smaller of the two: 1 would be perfect overlap. All four are
-measured in turn, again and again; the medians count. PyTorch has one thread, so that the workers have the other core.
+measured in turn, again and again; of the rates the medians count, and of the ratios within a round, so that a machine that
+is slower for a while slows both sides. PyTorch has one thread, so that the workers have the other core.
 """
 
 import argparse
@@ -77,16 +78,19 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
             rates[name].append(arguments.steps / (time.perf_counter() - before))
     for vector in (env, plain.get_env(), overlapped.get_env()):
         vector.close()  # type: ignore[union-attr]
-    row = {name: round(statistics.median(values), 1) for name, values in rates.items()}
-    bound = min(row["env_steps_per_s"], row["learner_steps_per_s"])
+    bounds = [min(pair) for pair in zip(rates["env_steps_per_s"], rates["learner_steps_per_s"], strict=True)]
+
+    def ratio(name: str) -> float:
+        return round(statistics.median(rate / bound for rate, bound in zip(rates[name], bounds, strict=True)), 2)
+
     return {
         "env": arguments.env,
         "envs": arguments.envs,
         "image_size": arguments.image_size,
         "batch": arguments.batch,
-        **row,
-        "ratio": round(row["steps_per_s"] / bound, 2),
-        "ratio_without_overlap": round(row["steps_per_s_without_overlap"] / bound, 2),
+        **{name: round(statistics.median(values), 1) for name, values in rates.items()},
+        "ratio": ratio("steps_per_s"),
+        "ratio_without_overlap": ratio("steps_per_s_without_overlap"),
     }
 
 
@@ -100,7 +104,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=64, help="transitions per update")
     parser.add_argument("--steps-per-update", type=int, default=1, help="environment steps for each update")
     parser.add_argument("--steps", type=int, default=200, help="environment steps in a turn")
-    parser.add_argument("--rounds", type=int, default=3, help="how often each has its turn")
+    parser.add_argument("--rounds", type=int, default=7, help="how often each has its turn")
     arguments = parser.parse_args()
     th.set_num_threads(1)
     row = measure(arguments)

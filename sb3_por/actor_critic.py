@@ -2,6 +2,7 @@
 
 import warnings
 from abc import ABC, abstractmethod
+from contextlib import nullcontext
 from typing import Any, ClassVar
 
 import torch as th
@@ -10,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.utils import polyak_update, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_por.acceleration import check_precision, compile_networks
+from sb3_por.acceleration import CompiledNetworks, check_precision, without_waiting
 from sb3_por.means import Means
 from sb3_por.memory import keep_freed_memory
 from sb3_por.objectives.base import Objective
@@ -149,8 +150,7 @@ class VisualActorCritic(SavedRandomness, ABC):
         if self.precision == "tf32":
             th.set_float32_matmul_precision("high")
             th.backends.cudnn.allow_tf32 = True
-        if self.compile_mode is not None:
-            compile_networks(self.policy, self.compile_mode)
+        self._compiled = None if self.compile_mode is None else CompiledNetworks(self.policy, self.compile_mode)
         self._metrics = Means()
         self._preparation = Preparation(
             self.policy,
@@ -217,9 +217,11 @@ class VisualActorCritic(SavedRandomness, ABC):
         if self.policy.objective_optimizer is not None:
             update_learning_rate(self.policy.objective_optimizer, self.aux_lr_ratio * learning_rate)
 
-        for _ in range(gradient_steps):
-            self._n_updates += 1
-            self._update(batch_size)
+        compiled = nullcontext() if self._compiled is None else self._compiled.in_place()
+        with without_waiting(self.device), compiled:
+            for _ in range(gradient_steps):
+                self._n_updates += 1
+                self._update(batch_size)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if self.device.type == "cpu":
@@ -385,7 +387,7 @@ class VisualActorCritic(SavedRandomness, ABC):
         for name, loss in (("critic", critic_loss), (self.policy.objective.name, objective_loss)):
             gradients = th.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
             parts = [gradient.norm() for gradient in gradients if gradient is not None]
-            norms[name] = th.stack(parts).norm() if parts else th.zeros(())
+            norms[name] = th.stack(parts).norm() if parts else loss.new_zeros(())
         return norms
 
     def _record_metrics(self) -> None:
@@ -443,4 +445,4 @@ class VisualActorCritic(SavedRandomness, ABC):
         return [*state_dicts, *own], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_preparation"]
+        return [*super()._excluded_save_params(), "_metrics", "_preparation", "_compiled"]

@@ -20,8 +20,9 @@ class Means:
         self._counts[name] = self._counts.get(name, 0) + 1
 
     def take(self) -> dict[str, float]:
-        """The means of all values since the last time; waits for their device."""
-        means = {name: total.item() / self._counts[name] for name, total in self._sums.items()}
+        """The means of all values since the last time; waits, once, for their device."""
+        totals = th.stack(list(self._sums.values())).tolist() if self._sums else []
+        means = {name: total / self._counts[name] for name, total in zip(self._sums, totals, strict=True)}
         self._sums.clear()
         self._counts.clear()
         return means

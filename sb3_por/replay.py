@@ -10,6 +10,8 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_por.acceleration import free_memory, to_device
+
 Observations = th.Tensor | TensorDict
 
 
@@ -77,7 +79,7 @@ class FrameStore:
             self.n_written = max(self.n_written, first_row + len(frames))
         else:
             target, first_row = self.loose, first_row - self.n_ring
-        target[first_row : first_row + len(frames)] = th.from_numpy(np.ascontiguousarray(frames))
+        target[first_row : first_row + len(frames)] = to_device(th.from_numpy(np.ascontiguousarray(frames)), target.device)
 
     def copy_loose(self, source: int, target: int) -> None:
         """
@@ -100,10 +102,10 @@ class FrameStore:
             # numpy copies whole rows: faster than torch's index_select on uint8
             frames = th.from_numpy(self.ring.numpy()[ring_rows])
         else:
-            frames = self.ring[th.from_numpy(ring_rows).to(self.ring.device)]
+            frames = self.ring[to_device(th.from_numpy(ring_rows), self.ring.device)]
         if len(is_loose) > 0:
-            loose_rows = th.from_numpy(flat[is_loose] - self.n_ring).to(self.ring.device)
-            frames[th.from_numpy(is_loose).to(self.ring.device)] = self.loose[loose_rows]
+            loose_rows = to_device(th.from_numpy(flat[is_loose] - self.n_ring), self.ring.device)
+            frames[to_device(th.from_numpy(is_loose), self.ring.device)] = self.loose[loose_rows]
         return frames.reshape(*rows.shape, *frames.shape[1:])
 
     def __getstate__(self) -> dict[str, Any]:
@@ -193,13 +195,12 @@ class SequenceReplayBuffer(NStepReplayBuffer):
             raise ValueError(f"storage must be 'auto', 'cpu' or 'cuda', not {storage!r}.")
         frame_bytes = sum(int(np.prod(shape)) * self._spaces[key].dtype.itemsize for key, shape in self._shapes.items())  # type: ignore[misc,union-attr]
         needed = n_frames * (frame_bytes + self.action_dim * 4 + 21)
-        if storage != "cpu" and self.device.type == "cuda":
-            free = th.cuda.mem_get_info(self.device)[0]
-            if storage == "cuda" or needed <= 0.4 * free:
-                self._check_memory(needed, free, n_frames, "GPU memory")
-                return self.device
-        elif storage == "cuda":
+        if storage == "cuda" and self.device.type != "cuda":
             raise ValueError("storage='cuda' needs a model on a CUDA device: use device='cuda', or storage='auto'.")
+        free = free_memory(self.device)
+        if free is not None and storage != "cpu" and (storage == "cuda" or needed <= 0.4 * free):
+            self._check_memory(needed, free, n_frames, "GPU memory")
+            return self.device
         self._check_memory(needed, psutil.virtual_memory().available, n_frames, "memory")
         return th.device("cpu")
 
@@ -385,10 +386,18 @@ class SequenceReplayBuffer(NStepReplayBuffer):
             window_mask=self.to_torch((steps < steps_left).astype(np.float32), copy=False),
         )
 
+    def to_torch(self, array: np.ndarray, copy: bool = True) -> th.Tensor:
+        """
+        :param array: Any array
+        :param copy: Whether the tensor must not share the array's memory
+        :return: The array on the device of the samples
+        """
+        return to_device(th.tensor(array) if copy else th.as_tensor(array), self.device)
+
     def _gather(self, rows: np.ndarray, env: VecNormalize | None) -> Observations:
         """Frames of these rows, normalized, on the device of the samples."""
         parts: dict[str, Any] = {key: store.gather(rows) for key, store in self._frames.items()}
         if env is not None:
             observations = self._normalize_obs(self._unwrap({key: part.cpu().numpy() for key, part in parts.items()}), env)
             parts = {key: th.as_tensor(part) for key, part in (observations if self.is_dict else {"": observations}).items()}  # type: ignore[union-attr]
-        return self._unwrap({key: part.to(self.device, non_blocking=True) for key, part in parts.items()})
+        return self._unwrap({key: to_device(part, self.device) for key, part in parts.items()})

@@ -8,7 +8,7 @@ import pytest
 import torch as th
 from toy_envs import DotEnv
 
-from sb3_por import SACPOR, SACSPR, SACDrQ
+from sb3_por import SACCURL, SACPOR, SACSPR, SACDrQ
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
@@ -66,10 +66,45 @@ def test_every_network_of_an_update_is_compiled(monkeypatch):
     assert len(graphs) >= 2 + 4 + 1 + 3
 
 
+@pytest.mark.parametrize("cls", [SACPOR, SACDrQ, SACCURL, SACSPR])
+def test_what_compiled_networks_return_is_not_used_after_the_update(cls, monkeypatch):
+    """CUDA graphs write the next update's results, gradients too, to where those of the last one were."""
+    returned, modules = [], []
+
+    def compile_like_a_graph(forward, mode):
+        modules.append(forward.__self__)
+        return lambda *inputs: returned.append(forward(*inputs)) or returned[-1]
+
+    def begin():
+        gradients = [parameter.grad for module in modules for parameter in module.parameters() if parameter.grad is not None]
+        for tensor in returned + gradients:
+            tensor.data.fill_(np.nan)
+        returned.clear()
+
+    plain = train(5, cls=cls, diagnostics_interval=2)
+    monkeypatch.setattr(th, "compile", compile_like_a_graph)
+    monkeypatch.setattr(th.compiler, "cudagraph_mark_step_begin", begin)
+    compiled = train(5, cls=cls, diagnostics_interval=2, compile_mode="reduce-overhead")
+    assert len(returned) > 10
+    assert difference(plain, compiled) == 0
+    metrics = compiled._metrics.take() | compiled.logger.name_to_value
+    assert all(np.isfinite(value) for value in metrics.values() if isinstance(value, float))
+
+
+def test_networks_are_compiled_for_updates_alone(monkeypatch):
+    calls = []
+    monkeypatch.setattr(th, "compile", lambda forward, mode: lambda *inputs: calls.append(mode) or forward(*inputs))
+    model = train(compile_mode="reduce-overhead")
+    assert set(calls) == {"reduce-overhead"}
+    calls.clear()
+    model.predict(DotEnv(falling=True).reset(seed=0)[0])
+    assert not calls
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler")
 def test_compiled_networks_train_as_others_do_and_save_as_they_do(tmp_path):
-    plain, compiled = train(), train(compile_mode="default", diagnostics_interval=2)
+    plain, compiled = (train(diagnostics_interval=2, compile_mode=mode) for mode in (None, "default"))
     assert difference(plain, compiled) < 1e-4
     compiled.save(tmp_path / "model")
     assert difference(SACPOR.load(tmp_path / "model"), compiled) == 0

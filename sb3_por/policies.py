@@ -4,10 +4,11 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import torch as th
+from gymnasium import spaces
 from sb3_contrib.tqc.policies import Critic as QuantileCritic
 from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
+from stable_baselines3.common.preprocessing import get_action_dim, is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
@@ -299,20 +300,23 @@ class VisualPolicy(Policy):
         :param observations: Observations as the environment gives them
         :return: What the trunks take: float, images in [0, 1] with channels last in memory
         """
-        preprocessed = preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
-        if isinstance(preprocessed, dict):
-            return {key: _channels_last(part) for key, part in preprocessed.items()}
-        return _channels_last(preprocessed)
+        if isinstance(observations, dict):
+            return {key: self._preprocess(part, self.observation_space[key]) for key, part in observations.items()}  # type: ignore[index]
+        return self._preprocess(observations, self.observation_space)
+
+    def _preprocess(self, part: th.Tensor, space: spaces.Space) -> Any:
+        if part.dim() == 4:
+            # As the trunks want images: rearranged once, while they are bytes
+            part = part.contiguous(memory_format=th.channels_last)
+        if self.normalize_images and part.dtype == th.uint8 and is_image_space(space):
+            # What preprocess_obs does, without a second copy of floats
+            return part.float().div_(255.0)
+        return preprocess_obs(part, space, normalize_images=self.normalize_images)
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
         if self.objective is not None:
             self.objective.train(mode)
-
-
-def _channels_last(observations: th.Tensor) -> th.Tensor:
-    """Images as the trunks want them, so that no trunk has to rearrange them again."""
-    return observations.contiguous(memory_format=th.channels_last) if observations.dim() == 4 else observations
 
 
 class VisualSACPolicy(VisualPolicy, SACPolicy):

@@ -53,7 +53,8 @@ class SequenceSamples(NamedTuple):
 class FrameStore:
     """
     Frames addressed by row numbers: a ring of fixed size, then loose rows for the frames that the ring has no place
-    for (the last frame of each episode and the newest frame of each environment).
+    for (the last frame of each episode and the newest frame of each environment). Images have channels last in memory, as
+    augmentation and convolutions want them.
 
     :param n_ring: Rows of the ring
     :param n_loose: Loose rows to begin with; their number grows
@@ -64,10 +65,22 @@ class FrameStore:
 
     def __init__(self, n_ring: int, n_loose: int, shape: tuple[int, ...], dtype: np.dtype, device: th.device):
         self.n_ring = n_ring
-        # Zeros from numpy take memory only once they are written to
-        self.ring = th.from_numpy(np.zeros((n_ring, *shape), dtype)).to(device)
-        self.loose = th.from_numpy(np.zeros((n_loose, *shape), dtype)).to(device)
+        self.shape = shape
+        self.ring, self.loose = self._zeros(n_ring, dtype, device), self._zeros(n_loose, dtype, device)
         self.n_written = 0
+
+    def _zeros(self, n: int, dtype: np.dtype, device: th.device) -> th.Tensor:
+        shape = (*self.shape[1:], self.shape[0]) if len(self.shape) == 3 else self.shape
+        # Zeros from numpy take memory only once they are written to
+        return self._as_shape(th.from_numpy(np.zeros((n, *shape), dtype)).to(device))
+
+    def _as_memory(self, frames: th.Tensor) -> th.Tensor:
+        """A view with the axes in the order of the memory."""
+        return frames.movedim(-3, -1) if len(self.shape) == 3 else frames
+
+    def _as_shape(self, frames: th.Tensor) -> th.Tensor:
+        """A view with the axes in the order of the frames' shape."""
+        return frames.movedim(-1, -3) if len(self.shape) == 3 else frames
 
     def write(self, first_row: int, frames: np.ndarray) -> None:
         """
@@ -98,28 +111,29 @@ class FrameStore:
         flat = rows.reshape(-1)
         is_loose = np.flatnonzero(flat >= self.n_ring)
         ring_rows = np.where(flat < self.n_ring, flat, 0)
-        if self.ring.device.type == "cpu":
+        ring = self._as_memory(self.ring)
+        if ring.device.type == "cpu":
             # numpy copies whole rows: faster than torch's index_select on uint8
-            frames = th.from_numpy(self.ring.numpy()[ring_rows])
+            frames = th.from_numpy(ring.numpy()[ring_rows])
         else:
-            frames = self.ring[to_device(th.from_numpy(ring_rows), self.ring.device)]
+            frames = ring[to_device(th.from_numpy(ring_rows), ring.device)]
         if len(is_loose) > 0:
-            loose_rows = to_device(th.from_numpy(flat[is_loose] - self.n_ring), self.ring.device)
-            frames[to_device(th.from_numpy(is_loose), self.ring.device)] = self.loose[loose_rows]
-        return frames.reshape(*rows.shape, *frames.shape[1:])
+            loose_rows = to_device(th.from_numpy(flat[is_loose] - self.n_ring), ring.device)
+            frames[to_device(th.from_numpy(is_loose), ring.device)] = self._as_memory(self.loose)[loose_rows]
+        return self._as_shape(frames.reshape(*rows.shape, *frames.shape[1:]))
 
     def __getstate__(self) -> dict[str, Any]:
         # Only what was written, and no device: a buffer from a GPU can be read without one
-        written = self.ring[: self.n_written].cpu().numpy()
-        return dict(n_ring=self.n_ring, ring=written, loose=self.loose.cpu().numpy(), device=str(self.ring.device))
+        ring, loose = (self._as_memory(part).cpu().numpy() for part in (self.ring[: self.n_written], self.loose))
+        return dict(n_ring=self.n_ring, shape=self.shape, ring=ring, loose=loose, device=str(self.ring.device))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         device = th.device(state["device"] if th.cuda.is_available() else "cpu")
         written, loose = state["ring"], state["loose"]
-        self.__init__(state["n_ring"], len(loose), written.shape[1:], written.dtype, device)  # type: ignore[misc]
+        self.__init__(state["n_ring"], len(loose), state["shape"], written.dtype, device)  # type: ignore[misc]
         self.n_written = len(written)
-        self.ring[: self.n_written] = th.from_numpy(written)
-        self.loose[:] = th.from_numpy(loose)
+        self._as_memory(self.ring)[: self.n_written] = th.from_numpy(written)
+        self._as_memory(self.loose)[:] = th.from_numpy(loose)
 
 
 class SequenceReplayBuffer(NStepReplayBuffer):

@@ -179,7 +179,7 @@ def diagnosis(suite: str) -> str:
         "gradient of the critic",
         "of λ POR",
         "std of features",
-        "correlation with the water",
+        "correlation",
     )
     return markdown(head, rows)
 
@@ -216,6 +216,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "trials": lambda: evaluations("trials"),
     "rope": lambda: evaluations("rope"),
     "fold": lambda: evaluations("fold"),
+    "fold_comparison": lambda: comparison("fold"),
+    "diagnosis_fold": lambda: diagnosis("fold"),
     "state": state,
     "diagnosis": lambda: diagnosis("main"),
     "diagnosis_full_speed": lambda: diagnosis("full_speed"),

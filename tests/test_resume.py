@@ -1,6 +1,7 @@
 """A run that is killed goes on from its last checkpoint and ends as if it had not been."""
 
 import os
+import math
 import pickle
 import random
 import signal
@@ -138,16 +139,18 @@ def assert_finished(run):
     assert args["seed"] == 1 and args["resume"] is None and args["trained_agent"] == ""
 
 
-def kill_during(command, run, past_step, delay):
+def kill_during(command, run, past_step, delay, within=math.inf):
     """
-    Start a command and kill it some time after it has a checkpoint past a step, or with -1 after it was started; True if
-    it was still running.
+    Start a command and kill it some time after it has a checkpoint past a step, at the latest within some seconds; True if it
+    was still running.
     """
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    last_moment = time.monotonic() + within
     while process.poll() is None:
         folder = latest_checkpoint(run)
-        if past_step < 0 or (folder is not None and int(folder.name.removeprefix("step_")) > past_step):
-            time.sleep(delay)
+        is_past = folder is not None and int(folder.name.removeprefix("step_")) > past_step
+        if is_past or time.monotonic() > last_moment:
+            time.sleep(delay if is_past else 0)
             process.send_signal(signal.SIGKILL)
             break
         time.sleep(0.01)
@@ -161,9 +164,9 @@ def kill_and_finish(folder, n_kills, rng):
     run = folder / "sac" / "Pendulum-v1_1"
     command = [sys.executable, "train.py", *FLAGS, *OFTEN, "-f", str(folder), *SMALL]
     for n in range(n_kills):
-        anywhere = n % 3 == 2
-        past_step = -1 if anywhere else n * N_STEPS // (n_kills + 2)
-        assert kill_during(command, run, past_step, delay=rng.uniform(0, 8 if anywhere else 0.5)), "it ended too early"
+        past_step = n * N_STEPS // (n_kills + 2)
+        within = rng.uniform(0, 8) if n % 3 == 2 else math.inf
+        assert kill_during(command, run, past_step, rng.uniform(0, 0.3), within), "it ended too early"
         command = [sys.executable, "train.py", "--resume", str(run)]
     # In this process: it starts faster.
     assert main(["--resume", str(run)]) == 0

@@ -53,8 +53,8 @@ class SequenceSamples(NamedTuple):
 class FrameStore:
     """
     Frames addressed by row numbers: a ring of fixed size, then loose rows for the frames that the ring has no place
-    for (the last frame of each episode and the newest frame of each environment). Images have channels last in memory, as
-    augmentation and convolutions want them.
+    for (the last frame of each episode and the newest frame of each environment). Images have channels last, as
+    augmentation and convolutions want them in memory.
 
     :param n_ring: Rows of the ring
     :param n_loose: Loose rows to begin with; their number grows
@@ -66,21 +66,16 @@ class FrameStore:
     def __init__(self, n_ring: int, n_loose: int, shape: tuple[int, ...], dtype: np.dtype, device: th.device):
         self.n_ring = n_ring
         self.shape = shape
-        self.ring, self.loose = self._zeros(n_ring, dtype, device), self._zeros(n_loose, dtype, device)
+        self.is_image = len(shape) == 3
+        in_memory = (*shape[1:], shape[0]) if self.is_image else shape
+        # Zeros from numpy take memory only once they are written to
+        self.ring = th.from_numpy(np.zeros((n_ring, *in_memory), dtype)).to(device)
+        self.loose = th.from_numpy(np.zeros((n_loose, *in_memory), dtype)).to(device)
         self.n_written = 0
 
-    def _zeros(self, n: int, dtype: np.dtype, device: th.device) -> th.Tensor:
-        shape = (*self.shape[1:], self.shape[0]) if len(self.shape) == 3 else self.shape
-        # Zeros from numpy take memory only once they are written to
-        return self._as_shape(th.from_numpy(np.zeros((n, *shape), dtype)).to(device))
-
-    def _as_memory(self, frames: th.Tensor) -> th.Tensor:
-        """A view with the axes in the order of the memory."""
-        return frames.movedim(-3, -1) if len(self.shape) == 3 else frames
-
     def _as_shape(self, frames: th.Tensor) -> th.Tensor:
-        """A view with the axes in the order of the frames' shape."""
-        return frames.movedim(-1, -3) if len(self.shape) == 3 else frames
+        """A view of frames in memory with the axes of their shape."""
+        return frames.movedim(-1, -3) if self.is_image else frames
 
     def write(self, first_row: int, frames: np.ndarray) -> None:
         """
@@ -92,7 +87,8 @@ class FrameStore:
             self.n_written = max(self.n_written, first_row + len(frames))
         else:
             target, first_row = self.loose, first_row - self.n_ring
-        target[first_row : first_row + len(frames)] = to_device(th.from_numpy(np.ascontiguousarray(frames)), target.device)
+        rows = self._as_shape(target[first_row : first_row + len(frames)])
+        rows.copy_(to_device(th.from_numpy(np.ascontiguousarray(frames)), target.device))
 
     def copy_loose(self, source: int, target: int) -> None:
         """
@@ -111,20 +107,26 @@ class FrameStore:
         flat = rows.reshape(-1)
         is_loose = np.flatnonzero(flat >= self.n_ring)
         ring_rows = np.where(flat < self.n_ring, flat, 0)
-        ring = self._as_memory(self.ring)
-        if ring.device.type == "cpu":
+        device = self.ring.device
+        if device.type == "cpu":
             # numpy copies whole rows: faster than torch's index_select on uint8
-            frames = th.from_numpy(ring.numpy()[ring_rows])
+            frames = th.from_numpy(self.ring.numpy()[ring_rows])
         else:
-            frames = ring[to_device(th.from_numpy(ring_rows), ring.device)]
+            frames = self.ring[to_device(th.from_numpy(ring_rows), device)]
         if len(is_loose) > 0:
-            loose_rows = to_device(th.from_numpy(flat[is_loose] - self.n_ring), ring.device)
-            frames[to_device(th.from_numpy(is_loose), ring.device)] = self._as_memory(self.loose)[loose_rows]
+            loose_rows = to_device(th.from_numpy(flat[is_loose] - self.n_ring), device)
+            frames[to_device(th.from_numpy(is_loose), device)] = self.loose[loose_rows]
         return self._as_shape(frames.reshape(*rows.shape, *frames.shape[1:]))
+
+    def in_ring(self) -> np.ndarray:
+        """
+        :return: Shape ``(rows of the ring, *frame shape)``; a view of the ring while that is not on a GPU
+        """
+        return self._as_shape(self.ring).cpu().numpy()
 
     def __getstate__(self) -> dict[str, Any]:
         # Only what was written, and no device: a buffer from a GPU can be read without one
-        ring, loose = (self._as_memory(part).cpu().numpy() for part in (self.ring[: self.n_written], self.loose))
+        ring, loose = self.ring[: self.n_written].cpu().numpy(), self.loose.cpu().numpy()
         return dict(n_ring=self.n_ring, shape=self.shape, ring=ring, loose=loose, device=str(self.ring.device))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -132,8 +134,8 @@ class FrameStore:
         written, loose = state["ring"], state["loose"]
         self.__init__(state["n_ring"], len(loose), state["shape"], written.dtype, device)  # type: ignore[misc]
         self.n_written = len(written)
-        self._as_memory(self.ring)[: self.n_written] = th.from_numpy(written)
-        self._as_memory(self.loose)[:] = th.from_numpy(loose)
+        self.ring[: self.n_written] = th.from_numpy(written)
+        self.loose[:] = th.from_numpy(loose)
 
 
 class SequenceReplayBuffer(NStepReplayBuffer):
@@ -233,7 +235,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
             a view of the buffer's memory while that is not on a GPU
         """
         size = (self.buffer_size, self.n_envs)
-        views = {key: frames.ring.cpu().numpy().reshape(*size, *self._shapes[key]) for key, frames in self._frames.items()}
+        views = {key: frames.in_ring().reshape(*size, *self._shapes[key]) for key, frames in self._frames.items()}
         return self._unwrap(views)
 
     def _wrap(self, obs: Any) -> dict[str, np.ndarray]:

@@ -77,17 +77,21 @@ def check(name, args, kwargs, tensors, from_device, target):
     """
     Count what the host waits for.
 
-    :raises RuntimeError: If the operation mixes tensors of the device with those of the host
+    :raises RuntimeError: If the operation mixes tensors of the device with those of the host, or the host does not wait for a
+        copy to itself, and would read what is not there yet
     """
     is_copy = name in ("_to_copy", "copy_")
     mixed = len({tensor.device.type for tensor in tensors if tensor.dim() > 0}) > 1
     if mixed and not is_copy:
         raise RuntimeError(f"{name} got tensors of the device and of the host")
     blocking = not (kwargs.get("non_blocking") or (name == "copy_" and args[2:] == (True,)))
+    to_host = from_device and target.type == "cpu"
+    if to_host and not blocking:
+        raise RuntimeError(f"{name} to the host without waiting for it")
     from_host = is_copy and any(tensor.device.type == "cpu" for tensor in tensors)
     # A mask is turned into indices first, whose number nobody knows before
     mask = name.startswith("index") and any(getattr(index, "dtype", None) == th.bool for index in tree_leaves(args[1]))
-    if (from_device and target.type == "cpu") or name in ASKING or mask or (from_host and blocking):
+    if to_host or name in ASKING or mask or (from_host and blocking):
         waits[name] += 1
 
 

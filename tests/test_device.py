@@ -111,13 +111,13 @@ def buffer_of(device):
     samples = sample(buffer)
     # As SB3 does with a buffer that it loads; a GPU's name is known everywhere, this one's only here
     buffer.device = th.device("cpu")
-    return pickle.dumps(buffer), samples
+    return pickle.dumps(buffer), samples, sample(buffer)
 
 
 def test_a_buffer_from_a_device_can_be_read_without_one(on_device):
-    pickled, samples = on_device(buffer_of, NAME)
-    buffer = pickle.loads(pickled)
-    assert np.array_equal(sample(buffer), samples) and samples.any()
+    pickled, samples, samples_to_host = on_device(buffer_of, NAME)
+    assert np.array_equal(sample(pickle.loads(pickled)), samples) and samples.any()
+    assert np.array_equal(samples_to_host, samples)
 
 
 def diagnose_on(device):
@@ -145,6 +145,10 @@ def count(function):
     return dict(waits)
 
 
+def bring_without_waiting():
+    th.zeros(2, device=NAME).to("cpu", non_blocking=True)
+
+
 def read_a_number(tensor):
     return tensor.sum().item()
 
@@ -160,6 +164,8 @@ def bring_a_number(tensor):
 def test_the_device_sees_what_is_mixed_and_what_waits(on_device):
     with pytest.raises(RuntimeError, match="of the device and of the host"):
         on_device(mix)
+    with pytest.raises(RuntimeError, match="without waiting"):
+        on_device(bring_without_waiting)
     assert on_device(count, read_a_number) == {"_local_scalar_dense": 1}
     assert on_device(count, take_positive) == {"index": 1}
     assert on_device(count, bring_a_number) == {"_to_copy": 2}

@@ -204,3 +204,12 @@ def test_refuses_what_does_not_fit_into_memory():
 def test_gpu_storage_needs_a_gpu_model():
     with pytest.raises(ValueError, match="needs a model on a CUDA device"):
         SequenceReplayBuffer(10, BOX, ACTION, "cpu", storage="cuda")
+
+
+def test_images_come_with_channels_last_in_memory_as_convolutions_want_them():
+    buffer = SequenceReplayBuffer(20, BOX, ACTION, device="cpu")
+    fill(buffer, BOX, 30)
+    samples = buffer.sample(16, future=(1, 3), window=2)
+    for images in (samples.observations, samples.next_observations, samples.future_observations):
+        assert images.shape == (16, 3, 8, 8) and images.is_contiguous(memory_format=th.channels_last)
+    assert samples.window_observations.flatten(0, 1).is_contiguous(memory_format=th.channels_last)

@@ -1,7 +1,7 @@
 """A run that is killed goes on from its last checkpoint and ends as if it had not been."""
 
-import os
 import math
+import os
 import pickle
 import random
 import signal

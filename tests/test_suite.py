@@ -346,8 +346,9 @@ def test_a_suite_of_six_runs_killed_twice_ends_like_an_uninterrupted_one(suite_f
     for workers_first in (False, True):
         process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
         before = checkpoints_of(root)
-        # The first checkpoint of a run, so that there is a run to take up
-        wait_for(lambda before=before: any(path.name == "step_50" for path in set(checkpoints_of(root)) - set(before)), 120)
+        # A checkpoint on the way, so that there is a run to take up
+        name = f"step_{rng.randrange(50, 250, 50)}"
+        wait_for(lambda before=before, name=name: name in {path.name for path in set(checkpoints_of(root)) - set(before)}, 120)
         time.sleep(rng.uniform(0, 0.3))
         kill_suite(process.pid, workers_first, 10)
         process.communicate()

@@ -9,6 +9,7 @@ import torch as th
 from gymnasium.wrappers import TransformReward
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import preprocess_obs
 from toy_envs import DotEnv
 
 from sb3_por import SACPOR, TQCPOR, SACDrQ, VisualSAC
@@ -317,3 +318,20 @@ def test_takes_sb3s_arguments_in_sb3s_order():
 def test_momentum_encoder_follows_tau_unless_told(cls, tau, expected):
     assert make_model(cls, tau=tau).momentum_tau == pytest.approx(expected)
     assert make_model(cls, tau=tau, encoder_tau=0.3).momentum_tau == 0.3
+
+
+@pytest.mark.parametrize("policy, obs_type, extractor", [("CnnPolicy", "pixels", POLICY), ("MultiInputPolicy", "dict", {})])
+def test_observations_are_preprocessed_as_sb3_does(policy, obs_type, extractor):
+    model = VisualSAC(policy, DotEnv(obs_type=obs_type), policy_kwargs=extractor, buffer_size=50, learning_starts=100).learn(
+        30
+    )
+    observations = model.replay_buffer.sample(8).observations
+    before = {key: part.clone() for key, part in observations.items()} if obs_type == "dict" else observations.clone()
+    ours, theirs = model.policy.preprocess(observations), preprocess_obs(observations, model.observation_space)
+    for one, other, given, kept in zip(*map(parts_of, (ours, theirs, observations, before)), strict=True):
+        assert one.dtype == th.float32 and th.equal(one, other)
+        assert th.equal(given, kept)
+
+
+def parts_of(observations):
+    return list(observations.values()) if isinstance(observations, dict) else [observations]

@@ -2,7 +2,7 @@
 
 import sys
 
-from sb3_por.zoo import main
+from sb3_por.training.zoo import main
 
 if __name__ == "__main__":
     sys.exit(main())

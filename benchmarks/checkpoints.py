@@ -18,7 +18,7 @@ import gymnasium as gym
 
 import softbody_envs  # noqa: F401  registers the tasks
 from sb3_por import SACPOR
-from sb3_por.checkpoints import save_checkpoint
+from sb3_por.runs.checkpoints import save_checkpoint
 
 ENV_ID = "PourWater-v0"
 #: Environment steps between the checkpoints after the first.

@@ -25,9 +25,9 @@ from gymnasium import spaces
 from torch import nn
 
 import softbody_envs  # noqa: F401  registers the tasks
-from sb3_por.augmentations import RandomShift
-from sb3_por.encoders import ConvEncoder
-from sb3_por.loading import load_model
+from sb3_por.evaluation.loading import load_model
+from sb3_por.visual.augmentations import RandomShift
+from sb3_por.visual.encoders import ConvEncoder
 from softbody_envs.experts import make_expert
 from softbody_envs.sim.pickers import REACH
 from softbody_envs.variations import SPLITS

@@ -28,10 +28,10 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 import softbody_envs  # noqa: F401  registers the tasks
-from sb3_por.acceleration import PRECISIONS
+from sb3_por.acceleration.precision import PRECISIONS
 from sb3_por.algorithms import SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ
-from sb3_por.encoders import ConvEncoder, make_projection
-from sb3_por.visual_sac import VisualSAC
+from sb3_por.visual.encoders import ConvEncoder, make_projection
+from sb3_por.visual.sac import VisualSAC
 
 #: Frames in the replay buffer while the updates are timed.
 N_FRAMES = 400

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_por.errors import UserError, exit_code
+from sb3_por.common.errors import UserError, exit_code
 
 
 class Parser(argparse.ArgumentParser):
@@ -51,8 +51,8 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """The model that the arguments name and the environment that it was trained in."""
     import softbody_envs  # noqa: F401  (registers its ids)
-    from sb3_por.loading import find_environment, load_model, settings_of, trained_in
-    from sb3_por.reference import REFERENCES
+    from sb3_por.evaluation.loading import find_environment, load_model, settings_of, trained_in
+    from sb3_por.evaluation.reference_policies import REFERENCES
 
     if args.seed < 0:
         raise UserError(f"--seed must not be negative, got {args.seed}")
@@ -66,7 +66,7 @@ def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
 
 
 def _evaluate(args: argparse.Namespace) -> None:
-    from sb3_por.evaluation import evaluate
+    from sb3_por.evaluation.evaluate import evaluate
 
     model, environment = _load(args)
     evaluation = evaluate(model, args.env, args.n_episodes, args.seed, **environment)
@@ -85,7 +85,7 @@ def _enjoy_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _enjoy(args: argparse.Namespace) -> None:
-    from sb3_por.film import check_film, film
+    from sb3_por.evaluation.video import check_film, film
 
     check_film(args.output)
     model, environment = _load(args)
@@ -94,8 +94,8 @@ def _enjoy(args: argparse.Namespace) -> None:
 
 
 def _plot_arguments(parser: argparse.ArgumentParser) -> None:
-    from sb3_por.figures import KINDS, ORDER
-    from sb3_por.scores import METRICS
+    from sb3_por.analysis.figures import KINDS, ORDER
+    from sb3_por.analysis.scores import METRICS
 
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
     output = "the figure: .png, .pdf or .svg; .csv: its numbers; with --kind all a folder for every figure in all formats"
@@ -110,10 +110,10 @@ def _plot_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _plot(args: argparse.Namespace) -> None:
-    from sb3_por import figures
-    from sb3_por.files import check_output, check_writable
-    from sb3_por.order_logs import find_order, read_order, write_order
-    from sb3_por.scores import read_scores, write_csv
+    from sb3_por.analysis import figures
+    from sb3_por.analysis.por_logs import find_order, read_order, write_order
+    from sb3_por.analysis.scores import read_scores, write_csv
+    from sb3_por.common.files import check_output, check_writable
 
     if args.kind == "all":
         check_writable(args.output)
@@ -154,8 +154,8 @@ def _diagnose_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _diagnose(args: argparse.Namespace) -> None:
-    from sb3_por.diagnostics import check_order, diagnose, diagnose_runs
-    from sb3_por.files import check_output
+    from sb3_por.analysis.diagnostics import check_order, diagnose, diagnose_runs
+    from sb3_por.common.files import check_output
 
     if args.csv:
         check_output(args.csv, (".csv",))
@@ -184,7 +184,7 @@ def _saliency_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _saliency(args: argparse.Namespace) -> None:
-    from sb3_por.saliency import draw_saliency
+    from sb3_por.analysis.saliency import draw_saliency
 
     model, environment = _load(args)
     step = draw_saliency(model, args.env, args.output, args.step, args.seed, **environment)
@@ -205,13 +205,13 @@ def _suite_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _suite(args: argparse.Namespace) -> int:
-    from sb3_por.suite import run_suite
+    from sb3_por.suites.run_suite import run_suite
 
     return run_suite(args.suite, args.root, args.dry_run, args.ray)
 
 
 def _report_arguments(parser: argparse.ArgumentParser) -> None:
-    from sb3_por.scores import METRICS
+    from sb3_por.analysis.scores import METRICS
 
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
     parser.add_argument("-o", "--output", required=True, help="folder that gets index.html, and figures/ for print")
@@ -224,7 +224,7 @@ def _report_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _report(args: argparse.Namespace) -> None:
     import softbody_envs  # noqa: F401  (registers its ids)
-    from sb3_por.report import write_report
+    from sb3_por.analysis.report import write_report
 
     print(write_report(args.paths, args.output, args.metric, args.step, args.seed, films=not args.no_films))
 

@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from sb3_por.actor_critic import VisualActorCritic
 from sb3_por.objectives import Contrastive, Objective, PartialOrder, SelfPredictive
-from sb3_por.visual_sac import VisualSAC
-from sb3_por.visual_tqc import VisualTQC
+from sb3_por.visual.actor_critic import VisualActorCritic
+from sb3_por.visual.sac import VisualSAC
+from sb3_por.visual.tqc import VisualTQC
 
 if TYPE_CHECKING:
     Mixed = VisualActorCritic  # what the mixin below is mixed into

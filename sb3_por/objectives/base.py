@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 import torch as th
 from torch import nn
 
-from sb3_por.views import Views
+from sb3_por.visual.views import Views
 
 
 class Objective(nn.Module, ABC):

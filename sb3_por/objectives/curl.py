@@ -5,7 +5,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_por.objectives.base import Objective
-from sb3_por.views import Views
+from sb3_por.visual.views import Views
 
 
 class Contrastive(Objective):

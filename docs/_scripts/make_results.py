@@ -1,0 +1,258 @@
+"""
+Fills in the tables of results.md, full_speed.md, trials.md and por.md from the tables in results/, and draws their figures.
+
+    python docs/_scripts/make_results.py              tables only
+    python docs/_scripts/make_results.py --figures    and the figures
+
+A table stands between `<!-- table: NAME -->` and `<!-- end -->`; ``TABLES`` has what makes each.
+"""
+
+import argparse
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import pandas as pd
+
+from sb3_por.analysis.figures import plot, plot_order
+from sb3_por.analysis.por_logs import read_order
+from sb3_por.analysis.scores import read_scores
+
+DOCS = Path(__file__).parents[1]
+RESULTS = DOCS.parent / "results"
+PAGES = ("results.md", "lab/full_speed.md", "lab/trials.md", "por.md")
+METRIC = "normalized_performance"
+#: Whom the paper compares POR with, from pixels.
+RIVALS = ("sac_drq", "sac_curl", "sac_spr")
+#: Task -> mean score that SAC is to reach from the state, and within how many steps.
+WANTED = {
+    "PourWater-v0": (0.8, 100_000),
+    "PourWaterAmount-v0": (0.7, 100_000),
+    "StraightenRope-v0": (0.85, 150_000),
+    "FoldCloth-v0": (0.6, 300_000),
+    "DropFoldCloth-v0": (0.5, 300_000),
+}
+
+
+def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table in Markdown."""
+    lines = [tuple(head), *map(tuple, rows)]
+    if len({len(line) for line in lines}) > 1:
+        raise ValueError(f"a row has not as many cells as the head, {lines[0]}")
+    lines.insert(1, ("---",) * len(lines[0]))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def with_interval(value: float, low: float, high: float) -> str:
+    """``0.50 [0.40, 0.60]``"""
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def comparison(suite: str) -> str:
+    """Every method on pouring: score, ratio to the best rival, whether POR is better, time."""
+    scores = read_scores([RESULTS / suite / "scores.csv"])
+    tables = {kind: plot(scores, kind)[0].table for kind in ("aggregates", "ratio", "improvement")}
+    means = tables["aggregates"].query("statistic == 'mean'").set_index("algo").sort_values("value", ascending=False)
+    ratios = tables["ratio"].set_index("algo")
+    better = {}
+    for pair in tables["improvement"].itertuples():
+        better[pair.algo, pair.rival] = pair.probability, pair.low, pair.high
+        better[pair.rival, pair.algo] = 1 - pair.probability, 1 - pair.high, 1 - pair.low
+    last = scores[scores["step"] == means["step"].iloc[0]]
+    rows = []
+    for algo, mean in means.iterrows():
+        runs = last[last["algo"] == algo].sort_values("seed")
+        ratio = with_interval(*ratios.loc[algo, ["ratio", "low", "high"]]) if algo in ratios.index else "-"
+        rows.append(
+            (
+                f"`{algo}`",
+                with_interval(mean["value"], mean["low"], mean["high"]),
+                ", ".join(f"{score:.2f}" for score in runs[METRIC]),
+                ratio,
+                with_interval(*better["sac_por", algo]) if algo != "sac_por" else "-",
+                f"{runs['wall_clock_s'].mean() / 60:.0f}",
+            )
+        )
+    head = ("", "mean", "each seed", "ratio to its best rival", "`sac_por` is better with probability", "minutes")
+    return markdown(head, rows)
+
+
+def rivals() -> str:
+    """The plain learner and POR beside those that the paper compares with."""
+    scores = read_scores([RESULTS / "main" / "scores.csv"])
+    rows = []
+    for algo in ("sac_por", "por_lambda_0"):
+        ratios = plot(scores[scores["algo"].isin([algo, *RIVALS])], "ratio")[0].table.set_index("algo")
+        row = ratios.loc[algo]
+        rows.append((f"`{algo}`", f"`{row['rival']}`", with_interval(*row[["ratio", "low", "high"]])))
+    return markdown(("", "best of the three", "ratio"), rows)
+
+
+def weights() -> str:
+    """POR by pairing and weight: each seed on the way, and at the end of `full_speed`."""
+    scores = pd.concat(read_scores([RESULTS / suite / "scores.csv"]) for suite in ("full_speed", "weights"))
+    runs = scores.sort_values("seed").groupby(["algo", "step"])[METRIC]
+    rows = []
+    for algo, pairing, weight in (
+        ("por_lambda_0", "-", 0),
+        ("por_10", "swap", 10),
+        ("sac_por", "swap", 100),
+        ("por_paper_10", "paper", 10),
+        ("por_paper", "paper", 100),
+    ):
+        columns = (", ".join(f"{score:.2f}" for score in runs.get_group((algo, step))) for step in (7500, 12500))
+        rows.append((f"`{algo}`", pairing, str(weight), *columns, f"{runs.get_group((algo, 12500)).mean():.2f}"))
+    return markdown(("", "pairing", "λ", "after 7500 steps", "after 12 500", "mean"), rows)
+
+
+def courses(suite: str) -> str:
+    """A few runs, each by itself: where it was best, and where it ended."""
+    scores = read_scores([RESULTS / suite / "scores.csv"])
+    rows = []
+    for (algo, seed), run in scores.groupby(["algo", "seed"]):
+        best, last = run.loc[run[METRIC].idxmax()], run.loc[run["step"].idxmax()]
+        rows.append(
+            (
+                f"`{algo}`",
+                str(seed),
+                f"{best[METRIC]:.2f} at {best['step'] / 1000:.0f}k",
+                f"{run.nlargest(4, 'step')[METRIC].mean():.2f}",
+                f"{last[METRIC]:.2f} at {last['step'] / 1000:.0f}k",
+                f"{last['wall_clock_s'] / 60:.0f}",
+            )
+        )
+    return markdown(("", "seed", "best evaluation", "mean of the last four", "last", "minutes"), rows)
+
+
+def evaluations(folder: str) -> str:
+    """Single runs: every evaluation."""
+    scores = read_scores([RESULTS / folder / "scores.csv"])
+    rows = []
+    for (env_id, name, seed), run in scores.groupby(["env", "algo", "seed"]):
+        run = run.sort_values("step")
+        course = ", ".join(f"{score:.2f}" for score in run[METRIC])
+        rows.append((f"`{env_id}`", f"`{name}`", str(seed), f"{run['step'].iloc[0] / 1000:g}k", course))
+    return markdown(("", "label", "seed", "every", "evaluations"), rows)
+
+
+def state() -> str:
+    """What SAC has reached from the state."""
+    scores = read_scores([RESULTS / "state" / "scores.csv"])
+    rows = []
+    for env_id, (wanted, within) in WANTED.items():
+        runs = scores[(scores["env"] == env_id) & (scores["step"] <= within)]
+        best = runs.loc[runs[METRIC].idxmax()]
+        reached = f"{best[METRIC]:.2f}" if best[METRIC] >= wanted else f"not yet: {best[METRIC]:.2f}"
+        rows.append(
+            (
+                f"`{env_id}`",
+                f"{wanted} within {within // 1000}k",
+                reached,
+                f"{best['step'] / 1000:.0f}k",
+                f"{runs['step'].max() / 1000:.0f}k",
+                f"{best['wall_clock_s'] / 60:.0f}",
+            )
+        )
+    return markdown(("", "wanted", "best evaluation", "at step", "stopped at", "minutes to the best"), rows)
+
+
+def diagnosis(suite: str) -> str:
+    """What the classifiers of the comparison have learned."""
+    table = pd.read_csv(RESULTS / suite / "diagnosis.csv")
+    rows = [
+        (
+            f"`{row.algo}`",
+            str(row.seed),
+            *(f"{value:.3f}" for value in (row.accuracy, row.random_accuracy, row.leak_accuracy)),
+            *(f"{value:.2g}" if value < 1 else f"{value:.0f}" for value in (row.grad_norm_critic, row.grad_norm_por)),
+            f"{row.feature_std:.3f}",
+            "-" if pd.isna(row.correlation) else f"{row.correlation:.2f}",
+        )
+        for row in table.sort_values(["algo", "seed"], ascending=[False, True]).itertuples()
+    ]
+    head = (
+        "",
+        "seed",
+        "accuracy",
+        "of random play",
+        "k = 0",
+        "gradient of the critic",
+        "of λ POR",
+        "std of features",
+        "correlation",
+    )
+    return markdown(head, rows)
+
+
+def leak() -> str:
+    """Both pairings where the answer is known: means over the last hundred updates."""
+    table = pd.read_csv(RESULTS / "leak" / "leak.csv")
+    last = table.sort_values("update").groupby(["env", "pairing"]).last()
+    names = {
+        "iid": "noise without time (`iid`)",
+        "SwingingBall-v0": "a reversible motion (`SwingingBall-v0`)",
+        "PourWater-v0": "pouring, mostly random play (`PourWater-v0`)",
+        "FallingBall-v0": "an order in every frame (`FallingBall-v0`)",
+    }
+    rows = []
+    for env, name in names.items():
+        for pairing in ("paper", "swap"):
+            row = last.loc[env, pairing]
+            numbers = row[["por_loss", "por_accuracy", "por_leak_loss", "por_leak_accuracy"]]
+            rows.append(
+                (name if pairing == "paper" else "", pairing, *(f"{x:.3f}" if x >= 0.001 else f"{x:.1g}" for x in numbers))
+            )
+    head = ("", "pairing", "loss, real pairs", "accuracy, real pairs", "loss, k = 0", "accuracy, k = 0")
+    return markdown(head, rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "comparison": lambda: comparison("main"),
+    "rivals": rivals,
+    "full_speed": lambda: comparison("full_speed"),
+    "weights": weights,
+    "longer": lambda: courses("long"),
+    "steady": lambda: courses("steady"),
+    "trials": lambda: evaluations("trials"),
+    "rope": lambda: evaluations("rope"),
+    "fold": lambda: evaluations("fold"),
+    "fold_comparison": lambda: comparison("fold"),
+    "diagnosis_fold": lambda: diagnosis("fold"),
+    "state": state,
+    "diagnosis": lambda: diagnosis("main"),
+    "diagnosis_full_speed": lambda: diagnosis("full_speed"),
+    "leak": leak,
+}
+
+
+def fill_in(page: str) -> str:
+    """A page with its tables as they follow from the results."""
+    return re.sub(
+        r"(<!-- table: (\w+) -->\n).*?(?=<!-- end -->)",
+        lambda match: f"{match[1]}\n{TABLES[match[2]]()}\n\n",
+        page,
+        flags=re.DOTALL,
+    )
+
+
+def draw() -> None:
+    """The figures of scores and of order."""
+    for suite in ("main", "full_speed", "weights", "long", "steady", "rope", "fold", "state"):
+        scores = read_scores([RESULTS / suite / "scores.csv"])
+        plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
+    for suite in ("main", "full_speed"):
+        plot_order(read_order([RESULTS / suite / "order.csv"]))[0].save(RESULTS / suite / "order.png")
+
+
+def main() -> None:
+    """Do what the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--figures", action="store_true", help="draw the figures, too")
+    if parser.parse_args().figures:
+        draw()
+    for name in PAGES:
+        (DOCS / name).write_text(fill_in((DOCS / name).read_text()))
+
+
+if __name__ == "__main__":
+    main()

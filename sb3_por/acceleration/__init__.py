@@ -1,0 +1,1 @@
+"""The same numbers in less time; a reader of the method may skip it."""

@@ -1,0 +1,270 @@
+"""One page that holds everything a set of runs has shown: it needs no network, no scripts and no other file."""
+
+import base64
+import mimetypes
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import jinja2
+import numpy as np
+import pandas as pd
+
+from sb3_por.analysis.diagnostics import check_order
+from sb3_por.analysis.figures import Plot, plot_all, save_all
+from sb3_por.analysis.learning_curves import in_order
+from sb3_por.analysis.plots import LABELS
+from sb3_por.analysis.por_logs import find_order
+from sb3_por.analysis.saliency import draw_saliency
+from sb3_por.analysis.scores import METRICS, RUN_KEYS, join_runs, read_csv, read_run
+from sb3_por.common.errors import UserError
+from sb3_por.common.files import atomic_write, check_writable
+from sb3_por.evaluation.loading import LOADABLE, find_environment, load_model, trained_in
+from sb3_por.evaluation.video import film
+from sb3_por.runs.facts import RunFacts, orphaned_logs, take_inventory
+from sb3_por.runs.folder import EVALUATIONS
+
+PAGE = "index.html"
+FIGURES = "figures"
+TEMPLATE = "report.html.jinja"
+#: Printed where there is no number.
+NOTHING = "-"
+#: Height and width of the films: small, since a page holds one for each task and algorithm.
+FILM_SIZE = 200
+#: Of tables that hold curves the page shows each curve's end; these columns name the curve. The whole is in the .csv.
+CURVES = {"iqm": ["algo"], "tasks": ["env", "algo"], "order": ["env", "algo", "metric"]}
+#: Tables that a reader has nothing of.
+UNREADABLE = ("profile",)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """
+    :param title: what it shows, in words
+    :param uri: the image itself, as a data URI
+    """
+
+    title: str
+    uri: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """
+    A figure on the page.
+
+    :param title: the question it answers
+    :param name: its file's
+    :param picture: the figure
+    :param header: of the table under it; no table if empty
+    :param rows: of that table, as it is printed
+    """
+
+    title: str
+    name: str
+    picture: Picture
+    header: list[str]
+    rows: list[list[str]]
+
+
+def write_report(
+    paths: list[str | Path],
+    folder: str | Path,
+    metric: str | None = None,
+    step: int | None = None,
+    seed: int = 0,
+    films: bool = True,
+) -> Path:
+    """
+    :param paths: run folders, folders that hold runs at any depth, and tables of scores (``.csv``), in any mixture
+    :param folder: gets ``index.html``, which stands by itself, and ``figures/`` with the same figures for print and their
+        numbers
+    :param metric: what to compare; by default the first of ``METRICS`` that is recorded
+    :param step: see :func:`sb3_por.analysis.learning_curves.read_grid`
+    :param seed: of the bootstrap
+    :param films: play the best models, and draw what their classifiers look at, which takes some seconds each
+    :return: the page
+    :raises UserError: if there is neither a run nor a score
+    """
+    folder = Path(folder)
+    check_writable(folder)
+    given = [Path(path) for path in paths]
+    folders = [path for path in given if path.suffix != ".csv"]
+    for path in folders:
+        if not path.is_dir():
+            raise UserError(f"there is no folder {path}")
+    runs, orphans = take_inventory(folders), orphaned_logs(folders)
+    scores = _scores([path for path in given if path.suffix == ".csv"], runs)
+    if scores is None and not runs and not orphans:
+        raise UserError(f"no run under {' '.join(map(str, folders))}")
+
+    plots: list[Plot] = []
+    shown: dict[str, list[Picture]] = {}
+    notes: list[str] = []
+    if not runs:
+        notes.append("made from scores alone: only run folders tell settings, machines and failures, and hold models to film")
+    if scores is None:
+        notes.append("no run was evaluated: there is nothing to plot")
+    else:
+        metric = metric or next((name for name in METRICS if scores[name].notna().any()), METRICS[0])
+        plots, left_out = plot_all(scores, find_order([run.folder for run in _evaluated(runs)]), metric, step, seed=seed)
+        notes += left_out
+        save_all(plots, folder / FIGURES)
+        if films:
+            shown = _show_models(_best_runs(runs, scores, metric), notes)
+    page = _template().render(
+        title=", ".join((path.parent if path.suffix == ".csv" else path).resolve().name for path in given),
+        metric=LABELS.get(metric or "", ""),
+        n_runs=len({(run.env, run.algo, run.seed) for run in runs} | _identities(scores)),
+        n_scores=0 if scores is None else len(scores),
+        runs=[_run_row(run, scores, metric) for run in runs],
+        commits=sorted({run.commit for run in runs} | (set() if scores is None else set(scores["commit"])) - {""}),
+        machines=sorted({run.machine for run in runs} - {""}),
+        settings=_settings(runs),
+        sections=[_section(one, folder / FIGURES) for one in plots],
+        films=shown,
+        unfinished=[run for run in runs if run.state != "finished"],
+        orphans=orphans,
+        notes=notes,
+    )
+    with atomic_write(folder / PAGE) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return folder / PAGE
+
+
+# -- parts of the page -------------------------------------------------------------------------------------------------
+
+
+def _evaluated(runs: list[RunFacts]) -> list[RunFacts]:
+    return [run for run in runs if (run.folder / EVALUATIONS).is_file()]
+
+
+def _scores(tables: list[Path], runs: list[RunFacts]) -> pd.DataFrame | None:
+    rows = [read_csv(path) for path in tables] + [read_run(run.folder) for run in _evaluated(runs)]
+    return join_runs(rows) if rows else None
+
+
+def _identities(scores: pd.DataFrame | None) -> set[tuple[str, str, int]]:
+    return set() if scores is None else set(scores[RUN_KEYS].itertuples(index=False, name=None))
+
+
+def _template() -> jinja2.Template:
+    loader = jinja2.PackageLoader("sb3_por.analysis", package_path="")
+    return jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True).get_template(TEMPLATE)
+
+
+def _section(plot: Plot, figures: Path) -> Section:
+    """
+    :param figures: where the figure was saved
+    """
+    table = plot.table
+    if plot.name in CURVES:
+        table = table.groupby(CURVES[plot.name], sort=False).tail(1)
+    header, rows = [], []
+    if plot.name not in UNREADABLE:
+        header = [name.replace("_", " ") for name in table.columns]
+        rows = [[_printed(value) for value in row] for row in table.itertuples(index=False)]
+    return Section(plot.title, plot.name, _picture(plot.title, figures / f"{plot.name}.png"), header, rows)
+
+
+def _run_row(run: RunFacts, scores: pd.DataFrame | None, metric: str | None) -> dict[str, str]:
+    """What the table of runs says of one."""
+    row = {
+        "algorithm": run.algo,
+        "environment": run.env,
+        "seed": str(run.seed),
+        "state": run.state,
+        "steps": f"{run.steps} of {run.planned}" if run.planned else str(run.steps),
+        "last score": NOTHING,
+        "best score": NOTHING,
+        "hours": NOTHING,
+        "commit": run.commit or "not recorded",
+        "machine": run.machine or "not recorded",
+    }
+    if scores is not None and metric is not None:
+        rows = _rows_of(run, scores)
+        values = rows[metric].dropna()
+        if len(values):
+            row |= {"last score": _printed(values.iloc[-1]), "best score": _printed(values.max())}
+        if rows["wall_clock_s"].notna().any():
+            row["hours"] = f"{rows['wall_clock_s'].max() / 3600:.2f}"
+    return row
+
+
+def _settings(runs: list[RunFacts]) -> list[dict[str, Any]]:
+    """The runs that share all their settings, and these."""
+    groups: dict[tuple[str, str, str], list[RunFacts]] = {}
+    for run in runs:
+        groups.setdefault((run.env, run.algo, repr(sorted(run.settings.items(), key=str))), []).append(run)
+    return [
+        {
+            "title": f"{algo} on {env}, seed{'s' if len(members) > 1 else ''} {', '.join(str(run.seed) for run in members)}",
+            "values": sorted(members[0].settings.items()),
+        }
+        for (env, algo, _), members in groups.items()
+    ]
+
+
+def _best_runs(runs: list[RunFacts], scores: pd.DataFrame, metric: str) -> Iterator[tuple[str, str, RunFacts, float]]:
+    """Of each task and algorithm the run with the best evaluation among those that have kept a model."""
+    with_model = [run for run in runs if (run.folder / "best_model.zip").is_file()]
+    for env in sorted({run.env for run in with_model}):
+        for algo in in_order(run.algo for run in with_model if run.env == env):
+            members = [run for run in with_model if (run.env, run.algo) == (env, algo)]
+            best = [_rows_of(run, scores)[metric].max() for run in members]
+            if np.isfinite(best).any():
+                yield env, algo, members[int(np.nanargmax(best))], float(np.nanmax(best))
+
+
+def _show_models(best: Iterator[tuple[str, str, RunFacts, float]], notes: list[str]) -> dict[str, list[Picture]]:
+    """
+    Task -> a film of each algorithm's best model, followed by its saliency map if it learns an order from images. What
+    cannot be shown is noted: a page about many runs is not to fail with one of them.
+    """
+    shown: dict[str, list[Picture]] = {}
+    for env, algo, run, score in best:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "film.gif"
+            try:
+                find_environment(env, run.folder)
+                model = load_model(run.folder, algo if algo in LOADABLE else None)
+                environment = trained_in(run.folder, env)
+                film(model, env, path, size=FILM_SIZE, **environment)
+                title = f"{algo}, seed {run.seed}: best of its evaluations {_printed(score)}"
+                shown.setdefault(env, []).append(_picture(title, path))
+                if _learns_order(model):
+                    path = Path(folder) / "saliency.png"
+                    frame = draw_saliency(model, env, path, **environment)
+                    title = f"{algo}, seed {run.seed}: what its classifier looks at in frame {frame}"
+                    shown[env].append(_picture(title, path))
+            except UserError as error:
+                notes.append(f"{run.name}: not everything can be shown of its model: {error}")
+    return shown
+
+
+def _learns_order(model: Any) -> bool:
+    try:
+        check_order(model)
+    except UserError:
+        return False
+    return True
+
+
+def _rows_of(run: RunFacts, scores: pd.DataFrame) -> pd.DataFrame:
+    return scores[(scores["env"] == run.env) & (scores["algo"] == run.algo) & (scores["seed"] == run.seed)]
+
+
+def _picture(title: str, path: Path) -> Picture:
+    kind = mimetypes.guess_type(path.name)[0]
+    return Picture(title, f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}")
+
+
+def _printed(value: Any) -> str:
+    """As the page prints a cell."""
+    if not isinstance(value, float | np.floating):
+        return str(value)
+    if np.isnan(value):
+        return NOTHING
+    return "∞" if np.isinf(value) else f"{value:.3f}"

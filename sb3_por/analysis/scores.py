@@ -1,0 +1,105 @@
+"""The table of scores: one row an evaluation, read from runs or from ``scores.csv``."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_por.common.errors import UserError, one_line
+from sb3_por.common.files import atomic_write
+from sb3_por.runs.facts import run_identity
+from sb3_por.runs.folder import find_runs, read_evaluations, run_arguments
+
+#: What identifies a run, and what an evaluation measures.
+RUN_KEYS = ["env", "algo", "seed"]
+METRICS = ["normalized_performance", "return", "success"]
+COLUMNS = [*RUN_KEYS, "step", *METRICS, "wall_clock_s", "commit"]
+
+
+def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
+    """
+    :param paths: run folders, folders that hold runs at any depth, and ``.csv`` files of scores, in any mixture
+    :return: one row an evaluation with the columns ``COLUMNS``, sorted; a metric that was not recorded is NaN
+    :raises UserError: if a path holds no scores, or two runs of one algorithm and environment have one seed
+    """
+    given = [Path(path) for path in paths]
+    tables = [read_csv(path) for path in given if path.suffix == ".csv"]
+    folders = [path for path in given if path.suffix != ".csv"]
+    tables += [read_run(run) for run in find_runs(folders)]
+    return join_runs(tables)
+
+
+def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:
+    """
+    :param tables: with the columns ``RUN_KEYS`` and step, at least one table; a run is in one of them
+    :return: all their rows, sorted
+    :raises UserError: if two runs of one algorithm and environment have one seed
+    """
+    rows = pd.concat(tables, ignore_index=True)
+    runs = pd.concat([table[RUN_KEYS].drop_duplicates() for table in tables])
+    doubled = pd.concat([runs[runs.duplicated()], rows[rows.duplicated([*RUN_KEYS, "step"])]])
+    if len(doubled):
+        env, algo, seed = doubled.iloc[0][RUN_KEYS]
+        raise UserError(
+            f"there are two runs of {algo} on {env} with seed {seed}; give one of them, or tell them apart: train.py --label "
+            "NAME, or label: NAME in the run's args.yml"
+        )
+    return rows.sort_values([*RUN_KEYS, "step"], kind="stable", ignore_index=True)
+
+
+def read_run(run: Path) -> pd.DataFrame:
+    """
+    :param run: a run folder; what its settings do not say is read from its path, ``<algo>/<env>_<n>``
+    :return: its rows of the table of scores; means over the episodes of each evaluation
+    :raises UserError: if its evaluations cannot be read
+    """
+    arrays = read_evaluations(run)
+    steps = arrays["timesteps"]
+    unknown = np.full(len(steps), np.nan)
+    return pd.DataFrame(
+        {
+            **run_identity(run),
+            "step": steps.astype(int),
+            "normalized_performance": _episode_mean(arrays, "normalized_performance", unknown),
+            "return": arrays["results"].mean(axis=1),
+            "success": _episode_mean(arrays, "successes", unknown),
+            "wall_clock_s": arrays.get("wall_clock_s", unknown),
+            "commit": run_arguments(run).get("commit", ""),
+        },
+        columns=COLUMNS,
+    )
+
+
+def read_csv(path: Path) -> pd.DataFrame:
+    """
+    :param path: a file that :func:`write_csv` wrote, or one with its columns
+    :raises UserError: if it cannot be read or lacks a column
+    """
+    try:
+        scores = pd.read_csv(path, dtype={"env": str, "algo": str, "commit": str}, keep_default_na=True)
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {path}: {one_line(error)}") from error
+    missing = [column for column in [*RUN_KEYS, "step"] if column not in scores]
+    if missing:
+        raise UserError(f"{path} has no column {', '.join(missing)}; a table of scores has {','.join(COLUMNS)}")
+    if scores.empty:
+        raise UserError(f"{path} holds no scores")
+    scores = scores.reindex(columns=COLUMNS)
+    scores["commit"] = scores["commit"].fillna("")
+    for column in ("seed", "step"):
+        if not pd.api.types.is_integer_dtype(scores[column]):
+            raise UserError(f"{path}: the column {column} must hold integers")
+    for column in [*METRICS, "wall_clock_s"]:
+        scores[column] = pd.to_numeric(scores[column], errors="coerce")
+    return scores
+
+
+def write_csv(scores: pd.DataFrame, path: str | Path) -> None:
+    """Write a table of scores; reading it gives the same table."""
+    with atomic_write(path) as temporary:
+        scores.to_csv(temporary, index=False, columns=COLUMNS)
+
+
+def _episode_mean(arrays: dict[str, np.ndarray], name: str, otherwise: np.ndarray) -> np.ndarray:
+    return arrays[name].astype(float).mean(axis=1) if name in arrays else otherwise

@@ -1,0 +1,1 @@
+"""Helpers of every other package; they know none of them."""

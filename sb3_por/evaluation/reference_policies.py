@@ -1,0 +1,88 @@
+"""The ends of the scale as models: policies that do nothing or act at random, and the scripted expert of a task."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_por.common.errors import UserError, check_known, one_line
+from softbody_envs.experts import EXPERT_IDS, make_expert
+from softbody_envs.registration import ENV_IDS
+
+
+class RandomModel:
+    """
+    Acts uniformly at random.
+
+    :param env_id: a Gymnasium id
+    :param seed: of the actions
+    """
+
+    def __init__(self, env_id: str, seed: int = 0) -> None:
+        self.observation_space, self.action_space = _spaces(env_id)
+        self.action_space.seed(seed)
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """One action for each of the observations."""
+        return np.stack([self.action_space.sample() for _ in observation]), state
+
+
+class IdleModel:
+    """
+    Does nothing: the middle of every action's range.
+
+    :param env_id: a Gymnasium id with a ``Box`` action space
+    """
+
+    def __init__(self, env_id: str) -> None:
+        self.observation_space, self.action_space = _spaces(env_id)
+        if not isinstance(self.action_space, gym.spaces.Box):
+            raise UserError(f"{env_id} has no middle of its actions, {self.action_space}, to do nothing with")
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """The same action for each of the observations."""
+        return np.stack([(self.action_space.low + self.action_space.high) / 2 for _ in observation]), state
+
+
+class ExpertModel:
+    """
+    Acts as the scripted expert of a task: the ceiling that a learner is measured against.
+
+    :param env_id: one of our environments
+    """
+
+    def __init__(self, env_id: str) -> None:
+        check_known("environment with an expert", env_id, EXPERT_IDS)
+        self.observation_space, self.action_space = _spaces(env_id)
+        self._make_expert = lambda: make_expert(env_id)
+        self._experts: list[Any] = []
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """One action for each of the state vectors."""
+        if len(self._experts) != len(observation):
+            self._experts = [self._make_expert() for _ in observation]
+        starts = np.zeros(len(observation), dtype=bool) if episode_start is None else episode_start
+        for expert, start in zip(self._experts, starts, strict=True):
+            if start:
+                expert.reset()
+        return np.stack([expert.act(vector) for expert, vector in zip(self._experts, observation, strict=True)]), state
+
+
+#: What ``--model`` takes besides files.
+REFERENCES = {"random": RandomModel, "nothing": IdleModel, "expert": ExpertModel}
+
+
+def _spaces(env_id: str) -> tuple[gym.Space, Any]:
+    try:
+        kwargs: dict[str, Any] = {"obs_type": "state"} if env_id in ENV_IDS else {}
+        env = gym.make(env_id, **kwargs)
+    except gym.error.Error as error:
+        raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
+    env.close()
+    return env.observation_space, env.action_space

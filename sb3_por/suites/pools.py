@@ -1,0 +1,158 @@
+"""Where the runs of a suite are done: processes of this machine. ``ray_pool.py`` has those of a cluster."""
+
+import ctypes
+import os
+import shutil
+import signal
+import subprocess
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Generator
+
+from sb3_por.runs.facts import progress
+from sb3_por.suites.suite_file import Run
+
+#: Seconds between two looks at what runs.
+POLL_S = 0.5
+
+
+class Pool(ABC):
+    """
+    Does what is left to do of some runs: finished ones are skipped, interrupted ones go on.
+
+    :param runs: the runs
+    """
+
+    def __init__(self, runs: list[Run]) -> None:
+        self.runs = runs
+        #: ``Run.state()`` to begin with, then ``"waiting"``, ``"running"``, ``"failed"`` or ``"finished"``
+        self.states = {run: run.state() for run in runs}
+        #: When a run began to run (``time.monotonic``) and how many steps it had then
+        self.started: dict[Run, tuple[float, int]] = {}
+        self._progress: dict[tuple[Run, str], tuple[int, float | None]] = {}
+
+    def work(self) -> Generator[None, None, None]:
+        """Yields now and then, until all runs are done; a caller that stops listening interrupts them."""
+        todo = [run for run in self.runs if self.states[run] != "finished"]
+        try:
+            while todo or self._active():
+                while todo and self._has_room():
+                    self._start(todo.pop(0))
+                self._look()
+                yield
+                if self._active():
+                    time.sleep(POLL_S)
+        finally:
+            active = self._active()
+            self._stop()
+            self.states |= {run: "interrupted" for run in active}
+
+    def progress(self, run: Run) -> tuple[int, float | None]:
+        """As :func:`sb3_por.runs.folder.progress`; the files of what does not run are read once."""
+        key = run, self.states[run]
+        if key not in self._progress or self.states[run] == "running":
+            self._progress[key] = progress(run.run_folder)
+        return self._progress[key]
+
+    def _active(self) -> list[Run]:
+        return [run for run, state in self.states.items() if state in ("waiting", "running")]
+
+    def _runs_now(self, run: Run) -> None:
+        self.states[run] = "running"
+        self.started[run] = time.monotonic(), progress(run.run_folder)[0]
+
+    @abstractmethod
+    def _has_room(self) -> bool:
+        """Whether one more run may be started."""
+
+    @abstractmethod
+    def _start(self, run: Run) -> None:
+        """Begin with a run: its state becomes ``"waiting"`` or ``"running"``."""
+
+    @abstractmethod
+    def _look(self) -> None:
+        """Bring the states up to date."""
+
+    @abstractmethod
+    def _stop(self) -> None:
+        """End what still runs, so that it can be taken up again."""
+
+
+class LocalPool(Pool):
+    """
+    Runs that are processes of this machine.
+
+    :param runs: the runs
+    :param workers: processes at a time
+    :param threads: threads of a process
+    """
+
+    def __init__(self, runs: list[Run], workers: int, threads: int) -> None:
+        super().__init__(runs)
+        self.workers = workers
+        self.threads = threads
+        self._processes: dict[Run, subprocess.Popen] = {}
+
+    def _has_room(self) -> bool:
+        return len(self._processes) < self.workers
+
+    def _start(self, run: Run) -> None:
+        self._processes[run] = start_process(run, self.threads)
+        self._runs_now(run)
+
+    def _look(self) -> None:
+        for run, process in list(self._processes.items()):
+            if process.poll() is not None:
+                del self._processes[run]
+                self.states[run] = final_state(run, process.returncode)
+
+    def _stop(self) -> None:
+        """Ask what still runs to save and stop."""
+        for process in self._processes.values():
+            process.terminate()
+        for process in self._processes.values():
+            process.wait()
+
+
+def start_process(run: Run, threads: int) -> subprocess.Popen:
+    """
+    Start a run or go on with it. It dies with the process that calls this, and writes to ``run.log``.
+
+    :param threads: threads of its numerical libraries
+    """
+    command = run.command()
+    if run.state() == "new":
+        # What a process left that was killed before it had written its settings.
+        shutil.rmtree(run.run_folder, ignore_errors=True)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    of_libraries = {name: str(threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    with open(run.log, "ab") as log:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=os.environ | of_libraries,
+            start_new_session=True,
+            preexec_fn=_die_with_parent,
+        )
+
+
+def final_state(run: Run, end: int | str) -> str:
+    """
+    :param end: the return code of the run's process, or what kept it from ending; the run's log says it
+    :return: ``"finished"`` or ``"failed"``
+    """
+    if end == 0:
+        return "finished"
+    if isinstance(end, int):
+        end = f"killed by {signal.Signals(-end).name}" if end < 0 else f"exit code {end}"
+    run.folder.mkdir(parents=True, exist_ok=True)
+    with open(run.log, "a") as log:
+        print(f"[{end}]", file=log)
+    return "failed"
+
+
+def _die_with_parent() -> None:
+    """A killed suite must not leave processes behind that its next start would run a second time (prctl, Linux)."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)

@@ -1,0 +1,153 @@
+"""Suites: a file that names algorithms, environments and seeds becomes runs, on this machine or on a Ray cluster."""
+
+import os
+import shlex
+import signal
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+from rich.console import Console
+from rich.live import Live
+from rich.table import Column, Table
+
+from sb3_por.analysis.scores import read_scores, write_csv
+from sb3_por.common.errors import UserError
+from sb3_por.runs.folder import read_settings
+from sb3_por.suites.pools import LocalPool, Pool
+from sb3_por.suites.suite_file import Run, Suite, read_suite, suite_runs
+
+#: Lines of a failed run's log that are shown.
+LOG_LINES = 8
+
+
+def run_suite(path: str | Path, root: str | Path = "runs", dry_run: bool = False, ray: str | None = None) -> int:
+    """
+    Do what is left to do of a suite.
+
+    :param path: the suite file
+    :param root: the runs go to ``<root>/<name of the file>/<env>/<algo>/seed_<seed>``
+    :param dry_run: print the runs and their states, and do nothing
+    :param ray: address of a Ray cluster to do the runs on; on this machine if ``None``
+    :return: 0 if every run is finished, 1 if some failed
+    :raises UserError: if the file is wrong, or the cluster cannot be used
+    """
+    suite = read_suite(path)
+    folder = Path(root) / Path(path).stem
+    runs = suite_runs(suite, folder)
+    if dry_run:
+        for run in runs:
+            print(f"{run.state():12} {shlex.join(run.command())}")
+        return 0
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            return _do(_pool(suite, runs, ray), folder)
+    except Timeout as error:
+        raise UserError(f"another process is at work on the suite in {folder}; wait for it, or give another --root") from error
+
+
+def _pool(suite: Suite, runs: list[Run], ray: str | None) -> Pool:
+    if ray is None:
+        return LocalPool(runs, suite.workers or max((os.cpu_count() or 1) // suite.threads, 1), suite.threads)
+    from sb3_por.suites.ray_pool import RayPool
+
+    return RayPool(runs, suite.threads, suite.gpus, ray)
+
+
+def _do(pool: Pool, folder: Path) -> int:
+    console = Console(stderr=True)
+    handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        _show_work(pool, console)
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt("interrupted; the same command goes on") from interrupt
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    console.print(progress_table(pool))
+    if any(run.run_folder.joinpath("evaluations.npz").exists() for run in pool.runs):
+        write_csv(read_scores([folder]), folder / "scores.csv")
+        print(folder / "scores.csv")
+    return _name_failed(pool)
+
+
+def _show_work(pool: Pool, console: Console) -> None:
+    """On a terminal a table that stays up to date, else a line for each change of state."""
+    with closing(pool.work()) as work:
+        if console.is_terminal:
+            with Live(progress_table(pool), console=console) as live:
+                for _ in work:
+                    live.update(progress_table(pool))
+            return
+        shown: dict[Run, str] = {}
+        for _ in work:
+            for run, state in pool.states.items():
+                if shown.get(run) != state:
+                    print(f"{state:12} {run.name}", file=sys.stderr, flush=True)
+                    shown[run] = state
+
+
+def _name_failed(pool: Pool) -> int:
+    """
+    Print the failed runs with the end of their logs.
+
+    :return: the exit code
+    """
+    failed = [run for run, state in pool.states.items() if state == "failed"]
+    for run in failed:
+        print(f"failed: {run.name}, {run.log}:", file=sys.stderr)
+        for line in run.log.read_text(errors="replace").splitlines()[-LOG_LINES:]:
+            print(f"  {line}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def progress_table(pool: Pool) -> Table:
+    """Of each run its state, steps, steps a second, latest score and the time left; below, the same of the suite."""
+    table = Table(Column("run", overflow="fold"), "state", "steps", "steps/s", "score", "time left")
+    speeds, left = [], 0
+    for run in pool.runs:
+        steps, score = pool.progress(run)
+        total = _total_steps(run)
+        speed = _steps_per_second(pool, run, steps)
+        if speed:
+            speeds.append(speed)
+        if pool.states[run] not in ("finished", "failed"):
+            left += max(total - steps, 0)
+        table.add_row(
+            run.name,
+            pool.states[run],
+            f"{steps}/{total}" if total else str(steps),
+            f"{speed:.0f}" if speed else "",
+            "" if score is None else f"{score:.3f}",
+            _duration((total - steps) / speed) if speed and total else "",
+        )
+    finished = sum(state == "finished" for state in pool.states.values())
+    table.caption = f"{finished} of {len(pool.runs)} runs finished"
+    if speeds:
+        table.caption += f", {sum(speeds):.0f} steps/s, {_duration(left / sum(speeds))} left"
+    return table
+
+
+def _steps_per_second(pool: Pool, run: Run, steps: int) -> float:
+    """Since the run was started; 0 if it does not run."""
+    if pool.states[run] != "running":
+        return 0.0
+    begin, steps_before = pool.started[run]
+    return max(steps - steps_before, 0) / max(time.monotonic() - begin, 1e-3)
+
+
+def _duration(seconds: float) -> str:
+    """Such as ``1:05 h``, ``12 min`` or ``30 s``."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02} h"
+
+
+def _total_steps(run: Run) -> int:
+    """Steps of a whole run; 0 as long as only its settings say it and it has not written them."""
+    if "-n" in run.flags:
+        return int(run.flags[run.flags.index("-n") + 1])
+    return int(read_settings(run.run_folder / run.env / "config.yml").get("n_timesteps") or 0)

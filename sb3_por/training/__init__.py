@@ -1,0 +1,1 @@
+"""One training run: the command line of train.py."""

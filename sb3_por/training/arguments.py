@@ -1,0 +1,145 @@
+"""Command-line arguments of train.py: the RL Zoo's, our defaults, and checks before anything is made."""
+
+import argparse
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import rl_zoo3.train
+import yaml
+from rl_zoo3 import ALGOS
+from rl_zoo3.utils import StoreDict
+
+import softbody_envs  # noqa: F401  (registers its ids)
+from sb3_por.common.errors import UserError, check_known, one_line
+from sb3_por.common.files import check_writable
+from sb3_por.evaluation.loading import find_environment, import_packages, model_file, read_data
+from sb3_por.runs.checkpoints import (
+    latest_checkpoint,
+    remove_checkpoints,
+)
+from sb3_por.runs.folder import run_arguments, the_run
+from sb3_por.runs.provenance import current_commit, current_machine
+
+EXAMPLE = """example:
+  python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:10.0 pairing:paper
+
+  python train.py --resume logs/sac_por/PourWater-v0_1
+
+  python train.py --algo sac_por --env PourWater-v0 -n 20000 -optimize --n-trials 50 --study-name pour --storage tuning.log
+
+Settings come from zoo_hyperparams/<algo>.yml, else from the RL Zoo's file of the algorithm. The run goes to
+<log-folder>/<algo>/<env>_<n>: best_model.zip, evaluations.npz, checkpoints, tb/ for TensorBoard."""
+
+
+#: Our defaults of the zoo's flags, where they differ.
+DEFAULTS = {"algo": "sac_por", "env": "PourWater-v0", "eval_freq": 2000, "save_freq": 10_000}
+
+
+class Settings(StoreDict):
+    """``key:value`` pairs whose values are Python, as in the zoo, or else plain words: ``pairing:paper``."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        stored: dict[str, Any] = {}
+        for pair in values:
+            one = argparse.Namespace()
+            try:
+                super().__call__(parser, one, [pair], option_string)
+                stored |= getattr(one, self.dest)
+                key, _, word = pair.partition(":")
+                if word.isidentifier() and callable(stored[key]):
+                    stored[key] = word  # obs_type:dict means the word, not Python's dict
+            except (NameError, SyntaxError):
+                key, colon, word = pair.partition(":")
+                if not colon or not word:
+                    parser.error(f"{option_string} takes key:value pairs, got {pair!r}")
+                stored[key] = word
+        setattr(namespace, self.dest, stored)
+
+
+class Parser(argparse.ArgumentParser):
+    """The zoo's parser with our defaults; what cannot work is said before anything is made."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            prog="train.py",
+            description="Train an agent, with the RL Zoo's flags.",
+            epilog=EXAMPLE,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+
+    def error(self, message: str) -> Any:
+        raise UserError(f"{message} (train.py --help lists the flags)")
+
+    def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
+        if "--algo" in names:
+            del options["choices"]  # checked below, with the nearest name
+        return super().add_argument(*names, **options)
+
+    def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]
+        self.set_defaults(**DEFAULTS, progress=sys.stderr.isatty())
+        self.add_argument("--resume", metavar="RUN_FOLDER", help="go on with a killed run; its folder has the settings")
+        self.add_argument("--label", metavar="NAME", help="what tables and figures call the run, instead of its algorithm")
+        args = super().parse_args()
+        if args.resume:
+            return self._resumed(Path(args.resume))
+        if args.track and importlib.util.find_spec("wandb") is None:
+            raise UserError("--track needs Weights & Biases: pip install wandb")
+        check_known("algorithm", args.algo, ALGOS)
+        import_packages(args.gym_packages)
+        args.env = find_environment(args.env)
+        if args.trained_agent:
+            args.trained_agent = str(model_file(args.trained_agent))
+            read_data(Path(args.trained_agent))
+        args.conf_file = args.conf_file or str(hyperparameter_file(args.algo, args.env))
+        if args.conf_file.endswith((".yml", ".yaml")):
+            _check_hyperparameters(Path(args.conf_file), args.env)
+        check_writable(args.log_folder)
+        args.commit = current_commit()
+        args.machine = current_machine()
+        return args
+
+    def _resumed(self, run: Path) -> argparse.Namespace:
+        """The arguments that a run was started with, changed by those given now."""
+        run = the_run(run)
+        saved = run_arguments(run)
+        if "env" not in saved:
+            raise UserError(f"{run} is not the folder of a run: no */args.yml in it; give <log-folder>/<algo>/<env>_<n>")
+        if (run / f"{saved['env']}.zip").exists() and latest_checkpoint(run) is None:
+            remove_checkpoints(run)  # what is left of them if the run was killed while it removed them
+            print(f"{run} is finished: nothing to do (train.py -i MODEL.zip begins a new run with its model)")
+            raise SystemExit(0)
+        self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
+        args = super().parse_args()
+        args.resume = str(run)
+        import_packages(args.gym_packages)
+        check_writable(run)
+        return args
+
+
+def hyperparameter_file(algo: str, env_id: str) -> Path:
+    """
+    The settings of an algorithm for an environment: ours where we list it, else the zoo's, else our default.
+
+    :raises UserError: if none fits
+    """
+    package = Path(__file__).parents[1]
+    # At the top of a checkout; inside the package where it was installed without -e.
+    ours = next((f for f in (package.parent, package) if (f / "zoo_hyperparams").is_dir()), package) / "zoo_hyperparams"
+    files = [folder / f"{algo}.yml" for folder in (ours, Path(rl_zoo3.__file__).parent / "hyperparams")]
+    entries = {file: yaml.safe_load(file.read_text()) for file in files if file.is_file()}
+    for key in (env_id, "default"):
+        for file, settings in entries.items():
+            if key in settings:
+                return file
+    raise UserError(f"there are no settings of {algo} for {env_id}; write some and pass -conf FILE.yml")
+
+
+def _check_hyperparameters(file: Path, env_id: str) -> None:
+    try:
+        settings = yaml.safe_load(file.read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise UserError(f"cannot read {file}: {one_line(error)}") from error
+    if not isinstance(settings, dict) or not {env_id, "default"} & set(settings):
+        raise UserError(f"{file} has no entry {env_id} and no entry default")

@@ -1,0 +1,222 @@
+"""What happens now and then during training: evaluation on held-out episodes, and checkpoints."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+
+from sb3_por.common.files import atomic_write
+from sb3_por.common.random_state import set_rng_state
+from sb3_por.evaluation.episodes import Episode, Evaluation, run_episodes, score
+from sb3_por.runs.checkpoints import save_checkpoint
+from sb3_por.runs.folder import EVALUATIONS
+
+
+def is_due(callback: BaseCallback, interval: int) -> bool:
+    """
+    Whether ``num_timesteps`` has just reached or passed a multiple of ``interval``. Unlike SB3's count of calls, it is
+    in environment steps for any number of environments, and a resumed run keeps the rhythm.
+    """
+    n_envs = callback.training_env.num_envs
+    return callback.num_timesteps // interval > (callback.num_timesteps - n_envs) // interval
+
+
+class Stopwatch:
+    """
+    How long a run has been at work, resumes and all, but not what a killed one did after its last checkpoint.
+
+    :param before: seconds until the checkpoint that it goes on from
+    """
+
+    def __init__(self, before: float = 0.0) -> None:
+        self._before = before
+        self._started = time.monotonic()
+
+    def seconds(self) -> float:
+        """Seconds so far."""
+        return self._before + time.monotonic() - self._started
+
+
+class EvaluationCallback(EvalCallback):
+    """
+    Plays the same held-out episodes at regular intervals and at the end of training.
+
+    Writes ``evaluations.npz`` in SB3's format (``timesteps``, ``results``, ``ep_lengths``, ``successes``) with
+    ``normalized_performance``, of the same shape as ``results``, and ``wall_clock_s`` (that the run took so far); keeps the
+    model with the best mean normalized performance as ``best_model.zip``; logs ``eval/*``.
+
+    :param eval_env: as :func:`sb3_por.evaluation.evaluate.run_episodes` takes it
+    :param episodes: what to play
+    :param eval_freq: interval in environment steps
+    :param run: the run's folder
+    :param stopwatch: of the run
+    :param callback_on_new_best: called when there is a new best model
+    :param verbose: 1: a line an evaluation
+    """
+
+    def __init__(
+        self,
+        eval_env: VecEnv,
+        episodes: list[Episode],
+        eval_freq: int,
+        run: str | Path,
+        stopwatch: Stopwatch,
+        callback_on_new_best: BaseCallback | None = None,
+        verbose: int = 1,
+    ) -> None:
+        super().__init__(
+            eval_env,
+            callback_on_new_best=callback_on_new_best,
+            n_eval_episodes=len(episodes),
+            eval_freq=eval_freq,
+            log_path=str(run),
+            best_model_save_path=str(run),
+            verbose=verbose,
+        )
+        self.episodes = episodes
+        self.run = Path(run)
+        self._history: dict[str, list[Any]] = {}
+        self.stopwatch = stopwatch
+
+    def _init_callback(self) -> None:
+        self.run.mkdir(parents=True, exist_ok=True)
+        if self.callback_on_new_best is not None:
+            self.callback_on_new_best.init_callback(self.model)
+
+    def _on_training_start(self) -> None:
+        file = self.run / EVALUATIONS
+        if self.num_timesteps > 0 and file.is_file():
+            self._take_up(file)
+
+    def _take_up(self, file: Path) -> None:
+        """A resumed run keeps the evaluations up to the step that it goes on from."""
+        with np.load(file) as arrays:
+            kept = arrays["timesteps"] <= self.num_timesteps
+            self._history = {name: list(arrays[name][kept]) for name in arrays.files}
+        if kept.any():
+            rows = zip(self._history["normalized_performance"], self._history["results"], strict=True)
+            self.best_mean_reward = max(score(performance, returns) for performance, returns in rows)
+
+    def _on_step(self) -> bool:
+        return self._evaluate() if is_due(self, self.eval_freq) else True
+
+    def _on_training_end(self) -> None:
+        if self._history.get("timesteps", [-1])[-1] != self.num_timesteps:
+            self._evaluate()
+
+    def _evaluate(self) -> bool:
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+        evaluation = run_episodes(self.model, self.eval_env, self.episodes)
+        self._record(evaluation)
+        if self.verbose > 0:
+            print(f"Step {self.num_timesteps}: {evaluation}")
+
+        self.last_mean_reward = float(np.mean(evaluation.returns))
+        go_on = True
+        if evaluation.score > self.best_mean_reward:
+            # SB3 calls the number that models are ranked by a reward, and other callbacks read it under that name.
+            self.best_mean_reward = evaluation.score
+            with atomic_write(self.run / "best_model.zip") as path:
+                self.model.save(path)
+            if self.callback_on_new_best is not None:
+                go_on = self.callback_on_new_best.on_step()
+        return go_on
+
+    def _record(self, evaluation: Evaluation) -> None:
+        """Append to ``evaluations.npz`` and to the logger."""
+        row = {
+            "timesteps": self.num_timesteps,
+            "results": evaluation.returns,
+            "ep_lengths": evaluation.lengths,
+            "successes": evaluation.successes,
+            "normalized_performance": evaluation.normalized_performance,
+            "wall_clock_s": self.stopwatch.seconds(),
+        }
+        for name, value in row.items():
+            self._history.setdefault(name, []).append(value)
+        with atomic_write(self.run / EVALUATIONS) as path:
+            np.savez(path, **{name: np.array(values) for name, values in self._history.items()})  # type: ignore[arg-type]
+
+        self.logger.record("eval/mean_reward", float(np.mean(evaluation.returns)))
+        self.logger.record("eval/mean_ep_length", float(np.mean(evaluation.lengths)))
+        for name, values in (
+            ("success_rate", evaluation.successes),
+            ("normalized_performance", evaluation.normalized_performance),
+        ):
+            if not np.isnan(np.mean(values)):
+                self.logger.record(f"eval/{name}", float(np.mean(values)))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+
+
+class SaveBestStatistics(BaseCallback):
+    """
+    Keeps the ``VecNormalize`` statistics that the best model was evaluated with; those at the end are others.
+
+    :param path: of the file
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def _on_step(self) -> bool:
+        statistics = self.model.get_vec_normalize_env()
+        if statistics is not None:
+            with atomic_write(self.path) as temporary:
+                statistics.save(str(temporary))
+        return True
+
+
+class CheckpointCallback(BaseCallback):
+    """
+    At regular intervals, saves the model as ``rl_model_<steps>_steps.zip`` and all that a killed run needs to go on.
+
+    Between two rollouts, when every transition is stored and every update is done; there it also ends the training that
+    a signal asked to stop.
+
+    :param save_freq: interval in environment steps; with 0 only when training is stopped
+    :param run: the run's folder
+    :param env_id: the environment
+    :param stopwatch: of the run
+    :param rng_state: states of the random generators to begin with
+    """
+
+    def __init__(
+        self, save_freq: int, run: str | Path, env_id: str, stopwatch: Stopwatch, rng_state: dict[str, Any] | None = None
+    ) -> None:
+        super().__init__()
+        self.stopwatch = stopwatch
+        self.save_freq = save_freq
+        self.run = Path(run)
+        self.env_id = env_id
+        self.rng_state = rng_state
+        self.stop_requested = False
+
+    def _on_training_start(self) -> None:
+        self._n_due = self._count_due()
+        if self.rng_state is not None:
+            set_rng_state(self.rng_state, self.model.action_space)
+
+    def _on_rollout_start(self) -> None:
+        if self._count_due() > self._n_due:
+            self._n_due = self._count_due()
+            with atomic_write(self.run / f"rl_model_{self.model.num_timesteps}_steps.zip") as path:
+                self.model.save(path)
+            self._save_checkpoint()
+        if self.stop_requested:
+            self._save_checkpoint()
+            raise KeyboardInterrupt
+
+    def _save_checkpoint(self) -> None:
+        save_checkpoint(self.model, self.run, self.env_id, self.stopwatch.seconds())
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _count_due(self) -> int:
+        return self.model.num_timesteps // self.save_freq if self.save_freq > 0 else 0

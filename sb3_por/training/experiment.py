@@ -1,0 +1,250 @@
+"""One run of train.py: the RL Zoo's ExperimentManager with evaluation, checkpoints and messages of ours."""
+
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from filelock import FileLock, Timeout
+from gymnasium import spaces
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import get_latest_run_id
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import ProgressBarCallback
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv
+
+import softbody_envs  # noqa: F401  (registers its ids)
+from sb3_por.common.errors import UserError, one_line
+from sb3_por.common.files import atomic_write, remove_unfinished
+from sb3_por.evaluation.episodes import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
+from sb3_por.evaluation.loading import quiet_n_steps
+from sb3_por.runs.checkpoints import (
+    latest_checkpoint,
+    read_rng_state,
+    read_seconds,
+    remove_checkpoints,
+    restore_buffer,
+    restore_monitors,
+)
+from sb3_por.runs.folder import BEST_STATISTICS, read_settings, write_settings
+from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
+
+
+def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
+    """
+    :param policy: what the settings name
+    :raises UserError: if the policy cannot read the observations
+    """
+    needed = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "CnnPolicy" if is_image_space(space) else "MlpPolicy"
+    # MlpPolicy flattens images, which works, however badly.
+    fits = policy == needed or (policy == "MlpPolicy" and needed == "CnnPolicy")
+    if policy in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy") and not fits:
+        alone = " policy_kwargs:{}" if needed == "MlpPolicy" else ""  # the settings may have those of convolutions
+        raise UserError(f"{policy} cannot read the observations of {env_id}, {space}; pass -params policy:{needed}{alone}")
+    if policy != needed and policy == "MlpPolicy":
+        print(
+            f"note: MlpPolicy flattens the images of {env_id} into {np.prod(space.shape)} numbers; you may want "  # type: ignore[arg-type]
+            "-params policy:CnnPolicy, or --env-kwargs obs_type:state where the environment has it",
+            file=sys.stderr,
+        )
+
+
+class Experiment(ExperimentManager):
+    """The zoo's manager of one run. Each method here mends one of its faults and says which."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._uuid = kwargs["uuid_str"]
+        self._folder_made = False
+        self._interrupted = False
+        self._resumed_run = Path(self.args.resume) if self.args.resume else None
+        self._checkpoint = latest_checkpoint(self._resumed_run) if self._resumed_run else None
+        if self._checkpoint:
+            self.trained_agent = str(self._checkpoint / "model.zip")
+            self.continue_training = True
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """``--env-kwargs`` and ``-params env_kwargs:`` add to the file's (the zoo's replace them), also in evaluation."""
+        changes = dict(self.custom_hyperparams or {})
+        given, self.env_kwargs = {**(changes.pop("env_kwargs", None) or {}), **self.env_kwargs}, {}
+        self.custom_hyperparams = changes
+        if self._resumed_run is None:
+            hyperparams, saved = super().read_hyperparameters()
+        else:
+            saved = read_settings(self._resumed_run / self.env_name / "config.yml") | changes
+            hyperparams = dict(saved)
+        self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
+        held_out = evaluation_kwargs(self.env_name.gym_id)
+        self.eval_env_kwargs = {**whole_episodes(self.env_kwargs), **held_out, **(self._eval_env_kwargs_args or {})}
+        return hyperparams, saved
+
+    def create_log_folder(self) -> None:
+        """The zoo looks for a free number and makes the folder later: runs started together would share it."""
+        while self._resumed_run is None:
+            run_id = get_latest_run_id(self.log_path, self.env_name) + 1
+            self.save_path = os.path.join(self.log_path, f"{self.env_name}_{run_id}{self._uuid}")
+            try:
+                os.makedirs(self.save_path, exist_ok=False)
+                break
+            except FileExistsError:
+                continue
+        if self._resumed_run is not None:
+            self.save_path = str(self._resumed_run)
+            # Monitor begins its file anew by default.
+            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": self._checkpoint is None}
+        self.params_path = os.path.join(self.save_path, self.env_name)
+        os.makedirs(self.params_path, exist_ok=True)
+        self._folder_made = self._resumed_run is None
+        self._lock_folder()
+        if self._resumed_run is not None:
+            remove_unfinished(self._resumed_run)
+            if self._checkpoint is not None:
+                restore_monitors(self._resumed_run, self._checkpoint)
+        if self.tensorboard_log is None and not self.optimize_hyperparameters:
+            self.tensorboard_log = os.path.join(self.save_path, "tb")
+
+    def _lock_folder(self) -> None:
+        """Two processes must not write one run. The system frees the lock of a killed one."""
+        self._lock = FileLock(os.path.join(self.save_path, ".lock"))
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout as error:
+            raise UserError(f"another process is at work in {self.save_path}") from error
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """Settings that cannot work leave one line and no folder."""
+        try:
+            return super().setup_experiment()
+        except (AssertionError, TypeError, ValueError, RuntimeError, gym.error.Error) as error:
+            if self._folder_made:
+                shutil.rmtree(self.save_path, ignore_errors=True)
+            if isinstance(error, UserError) or self.verbose > 1:
+                raise
+            message = f"{self.algo} cannot be set up on {self.env_name.gym_id}: {one_line(error)} (--verbose 2 shows where)"
+            raise UserError(message) from error
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """Evaluation plays the same held-out episodes each time; the zoo's begin as the training environment does."""
+        if not eval_env:
+            return super().create_envs(n_envs, no_log=no_log)
+        inner = self.env_wrapper
+        self.env_wrapper = FixedEpisodes if inner is None else lambda env: FixedEpisodes(inner(env))
+        try:
+            env = super().create_envs(n_envs, eval_env=True, no_log=no_log)
+        finally:
+            self.env_wrapper = inner
+        env.env_method("play", evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes))
+        return env
+
+    def create_callbacks(self) -> None:
+        """Our evaluation and checkpoints, counted in environment steps."""
+        if self.show_progress:
+            self.callbacks.append(ProgressBarCallback())
+        stopwatch = Stopwatch(read_seconds(self._checkpoint) if self._checkpoint else 0.0)
+        if self.eval_freq > 0 and not self.optimize_hyperparameters:
+            self.callbacks.append(
+                EvaluationCallback(
+                    self.create_envs(self.n_eval_envs, eval_env=True),
+                    evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes),
+                    self.eval_freq,
+                    self.save_path,
+                    stopwatch,
+                    callback_on_new_best=SaveBestStatistics(Path(self.params_path) / BEST_STATISTICS),
+                    verbose=self.verbose,
+                )
+            )
+        if not self.optimize_hyperparameters:
+            rng_state = read_rng_state(self._checkpoint) if self._checkpoint else None
+            self._checkpoints = CheckpointCallback(self.save_freq, self.save_path, self.env_name.gym_id, stopwatch, rng_state)
+            self.callbacks.append(self._checkpoints)
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        """From a checkpoint, the replay buffer, too; and scenes that were not drawn at the beginning of the run."""
+        with quiet_n_steps():
+            model = super()._load_pretrained_agent(hyperparams, env)
+        if self._checkpoint:
+            restore_buffer(model, self._checkpoint)
+            env.seed((self.seed + model.num_timesteps) % 2**32)
+        return model
+
+    def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> dict[str, Any]:
+        """The zoo's last step before it builds the model: see that the policy fits the observations."""
+        check_policy(hyperparams.get("policy"), env.observation_space, self.env_name.gym_id)
+        return super()._preprocess_action_noise(hyperparams, saved, env)
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        """Plain YAML; the zoo writes Python objects, which only an unsafe loader reads."""
+        write_settings(Path(self.params_path) / "config.yml", dict(sorted(saved_hyperparams.items())))
+        write_settings(Path(self.params_path) / "args.yml", dict(sorted({**vars(self.args), "resume": None}.items())))
+        if self._resumed_run is None:
+            (Path(self.params_path) / "command.txt").write_text(" ".join(sys.orig_argv))
+        print(f"Log path: {self.save_path}")
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """
+        A resumed run goes on counting: the zoo's would repeat its schedules and its random warm-up. Ctrl-C and SIGTERM end
+        it at the next safe place.
+        """
+        kwargs: dict[str, Any] = {"callback": self.callbacks, "reset_num_timesteps": not self.continue_training}
+        if self.log_interval != -1:
+            kwargs["log_interval"] = self.log_interval if self.log_interval > -1 else None
+        n_timesteps = self.n_timesteps
+        if self._checkpoint:
+            n_timesteps = max(n_timesteps, model._total_timesteps) - model.num_timesteps
+        handlers = {number: signal.signal(number, self._request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            model.learn(n_timesteps, **kwargs)
+        except KeyboardInterrupt:
+            self._interrupted = True
+        except ValueError as error:
+            if not has_diverged(model):
+                raise
+            raise UserError(
+                f"training diverged before step {model.num_timesteps}: the networks hold NaN. What was saved in "
+                f"{self.save_path} before is sound; a lower learning_rate may help"
+            ) from error
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+            self._close(model)
+
+    def _request_stop(self, number: int, frame: Any) -> None:
+        """The first signal waits for a safe place, the second does not."""
+        if self._checkpoints.stop_requested:
+            raise KeyboardInterrupt
+        self._checkpoints.stop_requested = True
+
+    def _close(self, model: BaseAlgorithm) -> None:
+        for callback in self.callbacks:
+            if isinstance(callback, ProgressBarCallback) and hasattr(callback, "pbar"):
+                callback.pbar.close()
+            if isinstance(callback, EvaluationCallback):
+                callback.eval_env.close()
+        if model.env is not None:
+            model.env.close()
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """Files are whole or absent."""
+        go_on = f"interrupted at step {model.num_timesteps}; go on with: python train.py --resume {self.save_path}"
+        if self._interrupted and latest_checkpoint(Path(self.save_path)) is None:
+            # A model without a checkpoint is what marks a finished run.
+            raise KeyboardInterrupt(go_on)
+        save: Callable[[Path], Any] = model.save
+        with atomic_write(Path(self.save_path) / f"{self.env_name}.zip") as path:
+            save(path)
+        if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
+            with atomic_write(Path(self.save_path) / "replay_buffer.pkl") as path:
+                model.save_replay_buffer(path)
+        statistics = model.get_vec_normalize_env()
+        if statistics is not None:
+            statistics.save(os.path.join(self.params_path, "vecnormalize.pkl"))
+        print(f"Saved to {self.save_path}")
+        if self._interrupted:
+            raise KeyboardInterrupt(go_on)
+        remove_checkpoints(Path(self.save_path))

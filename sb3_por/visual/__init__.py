@@ -1,0 +1,1 @@
+"""Actor-critics that learn from images: Algorithm 1's outer loop."""

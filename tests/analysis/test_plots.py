@@ -1,0 +1,162 @@
+"""Figures say what they show, look the same twice, and come with their numbers."""
+
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+from made_runs import log_order, random_scores, table, write_run
+from torch.utils.tensorboard import SummaryWriter
+
+from sb3_por.analysis.figures import KINDS, plot, plot_all, plot_order, save_all
+from sb3_por.analysis.plot_style import KNOWN, looks
+from sb3_por.analysis.por_logs import GRADIENT_METRICS, find_order, read_order, write_order
+from sb3_por.common.errors import UserError
+
+
+def texts(figure):
+    return "\n".join(
+        [text.get_text() for axes in figure.axes for text in axes.findobj(lambda one: hasattr(one, "get_text"))]
+        + [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+        + [figure.get_suptitle()]
+    )
+
+
+def test_the_curve_says_what_it_shows():
+    scores = random_scores(algos=("sac_por", "sac"), envs=("PourWater-v0",), n_seeds=3)
+    axes = plot(scores)[0].figure.axes[0]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["sac_por (3 seeds)", "sac (3 seeds)"]
+    assert axes.get_xlabel() == "environment steps" and axes.get_ylabel() == "normalized performance"
+    assert "PourWater-v0" in axes.get_title("left") and "95 %" in axes.get_title("left")
+    single = plot(scores[scores["seed"] == 0])[0].figure.axes[0]
+    assert "one seed, no interval" in single.get_title("left")
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("iqm", ["T, U", "sac_por (4 seeds, 2 tasks)", "interquartile mean"]),
+        ("tasks", ["T", "U", "sac_drq", "environment steps"]),
+        ("aggregates", ["IQM (higher is better)", "optimality gap (lower is better)", "sac_drq", "step 300"]),
+        ("profile", ["fraction of runs above τ", "normalized performance τ", "sac (4 seeds, 2 tasks)"]),
+        ("improvement", ["sac_por over sac_drq", "probability of improvement at step 300"]),
+        ("ratio", ["sac_por : sac_drq", "ratio at step 300"]),
+    ],
+)
+def test_every_figure_says_what_it_shows(kind, words):
+    figure = plot(random_scores(), kind, reps=50)[0].figure
+    for word in words:
+        assert word in texts(figure)
+
+
+def test_what_is_drawn_is_what_is_in_the_table():
+    one = plot(random_scores(), "tasks")[0]
+    drawn = {line.get_label(): line.get_ydata() for line in one.figure.axes[1].get_lines()}
+    for algo, rows in one.table[one.table["env"] == "U"].groupby("algo"):
+        assert drawn[algo] == pytest.approx(rows["mean"].to_numpy())
+
+
+def test_an_algorithm_looks_the_same_beside_any_others_and_unlike_them():
+    colors = [looks(["por_lambda_0", "por_paper"])[name].color for name in (*KNOWN, "por_lambda_0", "por_paper")]
+    assert len(set(colors)) == len(colors)
+    many = looks([*KNOWN, *(f"other{i}" for i in range(20))])
+    assert len(set(many.values())) == len(many)
+    assert looks(["sac"])["sac"] == looks(["ppo", "sac", "a2c"])["sac"]
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf", "svg", "csv"])
+def test_figures_are_the_same_byte_for_byte(suffix, tmp_path):
+    scores = pd.concat([table("a", "T", seed, [0.1, 0.2, seed / 10]) for seed in range(3)])
+    contents = []
+    for name in ("first", "second"):
+        plot(scores, reps=100)[0].save(tmp_path / f"{name}.{suffix}")
+        contents.append((tmp_path / f"{name}.{suffix}").read_bytes())
+    assert contents[0] == contents[1] and len(contents[0]) > 100
+    assert sorted(path.stem for path in tmp_path.iterdir()) == ["first", "second"]
+
+
+def test_figures_of_unknown_format_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"must end in \.png or \.pdf or \.svg or \.csv"):
+        plot(table("a", "T", 1, [0.1, 0.2, 0.3]))[0].save(tmp_path / "curve.bmp")
+
+
+def test_a_figure_of_nothing_is_refused_and_left_out_of_all():
+    alone = random_scores(algos=("sac_por",), n_seeds=2)
+    for kind, message in {
+        "improvement": r"one algorithm only \(sac_por\)",
+        "ratio": "no two algorithms that learn from images",
+    }.items():
+        with pytest.raises(UserError, match=message):
+            plot(alone, kind)
+    plots, notes = plot_all(alone, reps=20)
+    assert [one.name for one in plots] == ["iqm", "tasks", "aggregates", "profile"]
+    assert any("no probability of improvement" in note for note in notes) and any("no ratio" in note for note in notes)
+    short = random_scores(algos=("c",), n_seeds=2)
+    short.loc[short["seed"] == 0, "step"] += 10_000
+    plots, notes = plot_all(pd.concat([alone, short]), reps=20)
+    assert "tasks" in [one.name for one in plots]
+    assert any(note.startswith("left out: c on ") and "no step in common" in note for note in notes)
+    apart = pd.concat([random_scores(algos=("a",), envs=("T",)), random_scores(algos=("b",), envs=("U",))])
+    plots, notes = plot_all(apart, reps=20)
+    assert [one.name for one in plots] == ["iqm", "tasks"]
+    assert any(note.startswith("no figure profile: no environment was run with every algorithm") for note in notes)
+
+
+def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
+    for seed, losses in enumerate([(0.7, 0.6, 0.5), (0.7, 0.4, 0.1)]):
+        log_order(write_run(tmp_path, seed=seed), losses)
+    other = write_run(tmp_path, algo="sac_curl", seed=0)
+    with SummaryWriter(other / "tb" / "SACCURL_1") as writer:
+        writer.add_scalar("train/encoder_grad_norm_critic", 1.0, 100)
+    order = read_order([tmp_path])
+    assert set(order["algo"]) == {"sac_por"} and order["step"].tolist() == [100, 200, 300] * 2
+    assert order["por_loss"].to_numpy() == pytest.approx([0.7, 0.6, 0.5, 0.7, 0.4, 0.1])
+    assert order["por_leak_loss"].isna().all()
+    write_order(order, tmp_path / "order.csv")
+    pd.testing.assert_frame_equal(read_order([tmp_path / "order.csv"]), order)
+    one, notes = plot_order(order)
+    loss = one.table[one.table["metric"] == "por_loss"]
+    assert loss["mean"].to_numpy() == pytest.approx([0.7, 0.5, 0.3]) and not notes
+    assert {"POR loss", "POR accuracy", "PourWater-v0", "ln 2", "sac_por"} <= set(texts(one.figure).splitlines())
+    gradients = {line.get_label(): line.get_ydata().tolist() for line in one.figure.axes[-1].lines}
+    assert gradients["_sac_por"] == [10] * 3 and gradients["sac_por"] == pytest.approx([0.7, 0.5, 0.3])
+    drawn = [(line.get_color(), line.get_linestyle(), line.get_alpha()) for line in one.figure.axes[-1].lines]
+    assert len(set(drawn)) == len(drawn)
+    bare, _ = plot_order(order.drop(columns=GRADIENT_METRICS).reindex(columns=order.columns))
+    assert len(bare.figure.axes) == 2
+
+
+def test_what_a_resumed_run_logs_again_replaces_what_it_had_logged(tmp_path):
+    run = write_run(tmp_path)
+    log_order(run, [0.7, 0.6, 0.5, 0.4])
+    log_order(run, [0.3, 0.2], first_step=300)
+    log_order(run, [0.1], folder="SACPOR_2", first_step=400)
+    order = read_order([run])
+    assert order["step"].tolist() == [100, 200, 300, 400]
+    assert order["por_loss"].to_numpy() == pytest.approx([0.7, 0.6, 0.3, 0.1])
+
+
+def test_runs_without_an_order_are_said(tmp_path):
+    run = write_run(tmp_path, algo="sac")
+    assert find_order([run, "scores.csv"]) is None
+    with pytest.raises(UserError, match="no run has logged a POR loss"):
+        read_order([run])
+    (tmp_path / "scores.csv").write_text("env,algo,seed,step\n")
+    with pytest.raises(UserError, match="has no column por_loss"):
+        read_order([tmp_path / "scores.csv"])
+
+
+def test_a_grid_of_five_algorithms_four_tasks_five_seeds_is_quick(tmp_path):
+    scores = random_scores(algos="abcde", envs="TUVW", n_seeds=5, steps=list(range(0, 50_000, 1000)))
+    begin = time.perf_counter()
+    one, _ = plot(scores)
+    one.save(tmp_path / "curve.pdf")
+    assert time.perf_counter() - begin < 30
+    assert len(one.table) == 5 * 50
+
+
+def test_all_figures_are_saved_in_all_formats_under_their_names(tmp_path):
+    plots, _ = plot_all(random_scores(n_seeds=2), reps=20)
+    save_all(plots, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {f"{kind}.{end}" for kind in KINDS for end in ("png", "pdf", "csv")}
+    assert np.allclose(pd.read_csv(tmp_path / "iqm.csv")["iqm"], plots[0].table["iqm"], atol=1e-6)

@@ -1,0 +1,265 @@
+"""Evaluation plays the same held-out episodes for every model; models load from any sound file; films show the episodes."""
+
+import json
+import zipfile
+
+import gymnasium as gym
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from rl_zoo3.wrappers import TimeFeatureWrapper
+from sb3_contrib import TQC
+from stable_baselines3 import A2C, PPO, SAC, TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+from sb3_por.common.errors import UserError
+from sb3_por.evaluation.episodes import Episode, Evaluation, FixedEpisodes, evaluation_episodes, run_episodes
+from sb3_por.evaluation.evaluate import evaluate
+from sb3_por.evaluation.loading import load_model, trained_in
+from sb3_por.evaluation.reference_policies import ExpertModel, RandomModel
+from sb3_por.evaluation.video import film, write_film
+from softbody_envs.wrappers import ActionRepeat
+
+EPISODE_STEPS = 7
+
+
+class SeenVariations(gym.Wrapper):
+    """Notes the variation and seed of every reset."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.seen = []
+
+    def reset(self, *, seed=None, options=None):
+        self.seen.append((seed, (options or {}).get("variation")))
+        return self.env.reset(seed=seed, options=options)
+
+
+def short_pendulum():
+    return gym.make("Pendulum-v1", max_episode_steps=EPISODE_STEPS)
+
+
+@pytest.fixture(scope="module")
+def pendulum_model():
+    return SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, seed=3)
+
+
+@pytest.fixture(scope="module")
+def pendulum_zip(pendulum_model, tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "pendulum.zip"
+    pendulum_model.save(path)
+    return path
+
+
+def test_episodes_are_held_out_variations_in_a_fixed_order():
+    episodes = evaluation_episodes("PourWater-v0", 203, seed=5)
+    assert episodes[:2] == [Episode(0, 5, 800), Episode(1, 6, 801)]
+    assert episodes[199].variation == 999 and episodes[200].variation == 800
+    assert evaluation_episodes("Pendulum-v1", 1) == [Episode(0, 0, None)]
+
+
+@pytest.mark.parametrize("n_envs", [1, 2, 3])
+def test_any_number_of_environments_plays_the_same_episodes(n_envs, pendulum_model):
+    env = make_vec_env(short_pendulum, n_envs=n_envs, wrapper_class=FixedEpisodes)
+    episodes = [Episode(k, 40 + k, None) for k in range(4)]
+    first, second = (run_episodes(pendulum_model, env, episodes) for _ in range(2))
+    assert first.returns == second.returns
+    assert first.lengths == [EPISODE_STEPS] * 4
+    for k, expected in enumerate(first.returns):
+        single = make_vec_env(short_pendulum, wrapper_class=FixedEpisodes)
+        assert run_episodes(pendulum_model, single, [episodes[k]]).returns == [pytest.approx(expected)]
+
+
+def test_evaluation_resets_with_its_own_seed_and_variation():
+    seen = SeenVariations(gym.make("PourWater-v0", obs_type="state", split="eval"))
+    env = FixedEpisodes(seen)
+    env.play([Episode(0, 10, 803), Episode(1, 11, 901)])
+    infos = [env.reset(seed=99)[1] for _ in range(3)]
+    assert seen.seen == [(10, 803), (11, 901), (10, 803)]
+    assert [info["variation"] for info in infos] == [803, 901, 803]
+    env.close()
+
+
+def test_evaluation_leaves_the_global_generators_alone(pendulum_model):
+    np.random.seed(1)
+    th.manual_seed(1)
+    evaluate(pendulum_model, "Pendulum-v1", n_episodes=1)
+    drawn = np.random.rand(), th.rand(1).item()
+    np.random.seed(1)
+    th.manual_seed(1)
+    assert drawn == (np.random.rand(), th.rand(1).item())
+
+
+@pytest.mark.parametrize("obs_type", ["pixels", "dict", "state"])
+def test_observations_are_those_the_model_was_trained_on(obs_type):
+    policy = {"pixels": "CnnPolicy", "dict": "MultiInputPolicy", "state": "MlpPolicy"}[obs_type]
+    env = gym.make("PourWater-v0", obs_type=obs_type, image_size=40)
+    evaluation = evaluate(SAC(policy, env, buffer_size=10), "PourWater-v0", n_episodes=1)
+    assert evaluation.variations == [800] and evaluation.lengths == [100]
+    assert 0.0 <= evaluation.normalized_performance[0] <= 1.0
+
+
+def test_stacked_frames_and_normalised_observations_are_restored(tmp_path):
+    env = VecFrameStack(VecNormalize(make_vec_env("Pendulum-v1")), 3)
+    model = PPO("MlpPolicy", env)
+    env.venv.obs_rms.mean[:] = 5.0
+    (tmp_path / "Pendulum-v1").mkdir()
+    env.venv.save(str(tmp_path / "Pendulum-v1" / "vecnormalize.pkl"))
+    model.save(tmp_path / "best_model.zip")
+    environment = trained_in(tmp_path, "Pendulum-v1")
+    plain = evaluate(model, "Pendulum-v1", n_episodes=1)
+    normalised = evaluate(model, "Pendulum-v1", n_episodes=1, **environment)
+    assert plain.returns != normalised.returns
+    assert trained_in(tmp_path, "PourWater-v0") == {"env_kwargs": {}, "vec_normalize": None, "env_wrapper": None}
+
+
+def test_a_run_is_evaluated_in_the_environment_that_it_was_trained_in_but_on_whole_episodes(tmp_path):
+    model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, seed=0)
+    model.save(tmp_path / "best_model.zip")
+    (tmp_path / "Pendulum-v1").mkdir()
+    (tmp_path / "Pendulum-v1" / "config.yml").write_text("env_kwargs: {g: 1.0, max_episode_steps: 7}\n")
+    environment = trained_in(tmp_path, "Pendulum-v1")
+    assert environment == {"env_kwargs": {"g": 1.0}, "vec_normalize": None, "env_wrapper": None}
+    light = evaluate(model, "Pendulum-v1", n_episodes=1, **environment)
+    assert light.lengths == [200]
+    assert light.returns != evaluate(model, "Pendulum-v1", n_episodes=1).returns
+
+
+def test_a_run_is_evaluated_inside_the_wrappers_that_it_was_trained_in(tmp_path):
+    clipped = "gymnasium.wrappers.ClipReward: {min_reward: -2000000.0, max_reward: -1000000.0}"
+    wrappers = f"env_wrapper:\n- rl_zoo3.wrappers.TimeFeatureWrapper\n- {clipped}\n"
+    (tmp_path / "FallingBall-v0").mkdir()
+    (tmp_path / "FallingBall-v0" / "config.yml").write_text(wrappers)
+    model = SAC("MlpPolicy", TimeFeatureWrapper(gym.make("FallingBall-v0", obs_type="state")), buffer_size=10, seed=0)
+    model.save(tmp_path / "best_model.zip")
+    environment = trained_in(tmp_path, "FallingBall-v0")
+    evaluation = evaluate(model, "FallingBall-v0", n_episodes=1, **environment)
+    assert evaluation.returns[0] > -1e4  # the environment's own rewards, as in training
+    filmed = film(model, "FallingBall-v0", tmp_path / "film.gif", size=32, **environment)
+    assert filmed.returns == evaluation.returns
+    with pytest.raises(UserError, match="was not trained on FallingBall-v0"):
+        evaluate(model, "FallingBall-v0", n_episodes=1)
+    (tmp_path / "FallingBall-v0" / "config.yml").write_text("env_wrapper: no_such_package.Wrapper\n")
+    with pytest.raises(UserError, match="cannot import the env_wrapper no_such_package"):
+        trained_in(tmp_path, "FallingBall-v0")
+
+
+def test_expert_is_the_ceiling_and_random_the_floor():
+    expert = evaluate(ExpertModel("PourWater-v0"), "PourWater-v0", n_episodes=1)
+    random = evaluate(RandomModel("PourWater-v0"), "PourWater-v0", n_episodes=1)
+    assert expert.score > 0.7 > 0.3 > random.score
+    assert expert.successes == [1.0]
+
+
+def test_models_that_have_diverged_and_actions_that_are_not_finite_are_refused():
+    model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=10)
+    with th.no_grad():
+        model.actor.mu.bias.fill_(float("nan"))
+    with pytest.raises(UserError, match="diverged"):
+        evaluate(model, "Pendulum-v1", n_episodes=1)
+    env = FixedEpisodes(short_pendulum())
+    env.reset()
+    with pytest.raises(UserError, match="not finite"):
+        env.step(np.array([np.inf]))
+
+
+def test_a_model_of_another_environment_is_refused(pendulum_model):
+    with pytest.raises(UserError, match=r"not trained on PourWater-v0"):
+        evaluate(pendulum_model, "PourWater-v0", n_episodes=1)
+    with pytest.raises(UserError, match="at least 1 episode"):
+        evaluate(pendulum_model, "Pendulum-v1", n_episodes=0)
+
+
+def test_json_holds_no_nan_and_score_falls_back_to_the_return():
+    nan = float("nan")
+    evaluation = Evaluation([nan, nan], [-1.0, -3.0], [nan, nan], [7, 7], [None, None])
+    assert evaluation.score == -2.0
+    text = json.dumps(evaluation.as_dict(), allow_nan=False)
+    assert json.loads(text)["mean"] == {"normalized_performance": None, "return": -2.0, "success": None, "length": 7.0}
+    assert str(evaluation) == "return -2.000 ± 1.000, length 7 (2 episodes)"
+
+
+def test_algorithm_is_found_from_the_file(pendulum_zip, tmp_path, pendulum_model):
+    loaded = load_model(pendulum_zip)
+    assert type(loaded) is SAC and loaded.replay_buffer.buffer_size == 1
+    observation = np.array([0.1, 0.2, 0.3], dtype=np.float32)
+    assert np.array_equal(
+        loaded.predict(observation, deterministic=True)[0], pendulum_model.predict(observation, deterministic=True)[0]
+    )
+    for cls in (A2C, PPO, TD3, TQC):
+        cls("MlpPolicy", "Pendulum-v1").save(tmp_path / "model.zip")
+        assert type(load_model(tmp_path / "model.zip")) is cls
+
+
+def test_a_model_with_n_step_returns_is_loaded_without_a_warning(tmp_path, recwarn):
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, n_steps=3).save(tmp_path / "model.zip")
+    assert load_model(tmp_path / "model.zip").n_steps == 3
+    assert not [warning for warning in recwarn if "n_steps" in str(warning.message)]
+
+
+def test_files_that_are_no_models_are_refused(pendulum_zip, tmp_path):
+    whole = pendulum_zip.read_bytes()
+    (tmp_path / "text.zip").write_text("no zip")
+    (tmp_path / "cut.zip").write_bytes(whole[: len(whole) // 2])
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0xFF
+    (tmp_path / "flipped.zip").write_bytes(bytes(flipped))
+    with zipfile.ZipFile(tmp_path / "foreign.zip", "w") as archive:
+        archive.writestr("a.txt", "hello")
+    with zipfile.ZipFile(tmp_path / "list.zip", "w") as archive:
+        archive.writestr("data", "[]")
+    for name, message in {
+        "missing": "there is no model",
+        "text": "corrupt",
+        "cut": "corrupt",
+        "flipped": "corrupt",
+        "foreign": "not saved by Stable-Baselines3",
+        "list": "not saved by Stable-Baselines3",
+    }.items():
+        with pytest.raises(UserError, match=message) as error:
+            load_model(tmp_path / f"{name}.zip")
+        assert "\n" not in str(error.value)
+
+
+def test_a_named_algorithm_must_be_known_and_must_be_the_models(pendulum_zip):
+    with pytest.raises(UserError, match=r"unknown algorithm 'sacc'; did you mean sac\?"):
+        load_model(pendulum_zip, algo="sacc")
+    with pytest.raises(UserError, match="not a model of ppo"):
+        load_model(pendulum_zip, algo="ppo")
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_a_film_has_a_frame_for_the_reset_and_each_step(suffix, tmp_path):
+    path = tmp_path / f"film.{suffix}"
+    evaluation = film(ExpertModel("PourWater-v0"), "PourWater-v0", path, size=64)
+    frames = imageio.mimread(path, memtest=False)
+    # A GIF joins frames that are alike, such as those of water at rest.
+    assert 20 < len(frames) <= 101 and frames[0].shape[:2] == (64, 64)
+    assert evaluation.lengths == [100]
+    assert not np.array_equal(frames[0][..., :3], frames[-1][..., :3])
+
+
+def test_a_film_shows_the_steps_that_a_wrapper_makes_of_one(tmp_path):
+    path = tmp_path / "film.mp4"
+    filmed = film(
+        ExpertModel("PourWater-v0"), "PourWater-v0", path, size=64, env_wrapper=lambda env: ActionRepeat(env, repeat=10)
+    )
+    assert len(imageio.mimread(path, memtest=False)) == 101 and filmed.lengths == [100]
+
+
+def test_films_of_odd_size_and_unknown_format(tmp_path):
+    frames = [np.full((31, 33, 3), value, dtype=np.uint8) for value in (0, 250)]
+    write_film(tmp_path / "odd.mp4", frames, fps=5)
+    assert len(imageio.mimread(tmp_path / "odd.mp4")) == 2
+    with pytest.raises(UserError, match=r"must end in \.gif or \.mp4"):
+        write_film(tmp_path / "film.avi", frames, fps=5)
+    assert [path.name for path in tmp_path.iterdir()] == ["odd.mp4"]
+
+
+def test_spaces_without_a_shape_are_evaluated():
+    env = gym.make("CartPole-v1")
+    assert isinstance(env.action_space, spaces.Discrete)
+    assert evaluate(PPO("MlpPolicy", env), "CartPole-v1", n_episodes=2).lengths[0] > 0

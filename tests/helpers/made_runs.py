@@ -1,0 +1,58 @@
+"""Runs and tables of scores made for tests."""
+
+import numpy as np
+import pandas as pd
+import yaml
+from torch.utils.tensorboard import SummaryWriter
+
+from sb3_por.analysis.scores import COLUMNS
+
+STEPS = [100, 200, 300]
+
+
+def write_run(
+    folder, algo="sac_por", env="PourWater-v0", seed=1, performance=(0.1, 0.2, 0.4), steps=STEPS, settings=True, label=None
+):
+    """A run folder as train.py leaves it, two episodes an evaluation."""
+    run = folder / algo / f"{env}_{seed}"
+    (run / env).mkdir(parents=True)
+    if settings:
+        arguments = {"algo": algo, "env": env, "seed": seed, "commit": "abc", "label": label}
+        (run / env / "args.yml").write_text(yaml.safe_dump(arguments))
+    episodes = np.array(performance)[:, None] + np.array([-0.05, 0.05])
+    np.savez(
+        run / "evaluations.npz",
+        timesteps=steps,
+        results=episodes * 100,
+        ep_lengths=np.full(episodes.shape, 100),
+        successes=episodes > 0.3,
+        normalized_performance=episodes,
+        wall_clock_s=np.array(steps) / 10,
+    )
+    return run
+
+
+def log_order(run, losses, folder="SACPOR_1", first_step=100):
+    """TensorBoard files as a run of POR writes them."""
+    with SummaryWriter(run / "tb" / folder) as writer:
+        for i, loss in enumerate(losses):
+            writer.add_scalar("train/por_loss", loss, first_step + 100 * i)
+            writer.add_scalar("train/por_accuracy", 1 - loss, first_step + 100 * i)
+            writer.add_scalar("train/encoder_grad_norm_critic", 10.0, first_step + 100 * i)
+            writer.add_scalar("train/encoder_grad_norm_por", loss, first_step + 100 * i)
+
+
+def table(algo, env, seed, performance, steps=STEPS):
+    """The rows of one run in a table of scores."""
+    return pd.DataFrame(
+        {"env": env, "algo": algo, "seed": seed, "step": steps, "normalized_performance": performance, "commit": ""},
+        columns=COLUMNS,
+    )
+
+
+def random_scores(algos=("sac_por", "sac_drq", "sac"), envs=("T", "U"), n_seeds=4, steps=STEPS):
+    """A full grid of random scores; those of the first algorithm are 0.3 higher."""
+    rng = np.random.default_rng(0)
+    runs = [(algo, env, seed) for algo in algos for env in envs for seed in range(n_seeds)]
+    tables = [table(*run, 0.7 * rng.uniform(size=len(steps)) + 0.3 * (run[0] == algos[0]), steps) for run in runs]
+    return pd.concat(tables, ignore_index=True)

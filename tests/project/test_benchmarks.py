@@ -1,0 +1,63 @@
+"""The benchmarks measure what they say: the learner's floor has the passes that it makes, a probe reads what features tell."""
+
+import argparse
+import importlib.util
+from pathlib import Path
+
+import pytest
+import torch as th
+from torch import nn
+from toy_envs import DotEnv
+
+from sb3_por import SACDrQ
+
+
+def load(name):
+    path = Path(__file__).parents[2] / "benchmarks" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"{name}_benchmark", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+encoders, learner = load("encoders"), load("learner")
+
+
+@pytest.mark.parametrize("name", learner.ALGORITHMS)
+def test_the_floor_has_the_passes_of_the_algorithm(name, monkeypatch):
+    monkeypatch.setattr(learner, "N_FRAMES", 20)
+    model = learner.make_model(name, batch=8, image_size=64, device="cpu", options={})
+    passes = {"forward": 0, "back": 0}
+
+    def count(conv, inputs, output):
+        passes["forward"] += len(output)
+        if output.requires_grad:
+            output.register_hook(arrive)
+
+    def arrive(gradient):
+        passes["back"] += len(gradient)
+
+    first_layers = {id(module): module for module in model.policy.modules() if isinstance(module, nn.Conv2d)}
+    for conv in first_layers.values():
+        if conv.in_channels == 3:
+            conv.register_forward_hook(count)
+    # Not an update of which the actor or the targets make nothing, and none with diagnostics
+    model._n_updates = 1
+    th.manual_seed(0)
+    model.train(1, 8)
+    trained, untrained, again = learner.ALGORITHMS[name][2]
+    assert (passes["forward"] / 8, passes["back"] / 8) == (trained + untrained, trained + again)
+
+
+def test_a_probe_reads_what_an_agents_features_tell(tmp_path):
+    model = SACDrQ("CnnPolicy", DotEnv(), policy_kwargs=dict(features_extractor_kwargs=dict(n_filters=4)), buffer_size=10)
+    model.save(tmp_path / "model.zip")
+    th.manual_seed(0)
+    frames = th.randint(0, 256, (200, *model.observation_space.shape), dtype=th.uint8)
+    with th.no_grad():
+        targets = model.critic.encode(frames)[:, :8]
+    arguments = argparse.Namespace(updates=300, batch=32)
+    told = encoders.probe(tmp_path / "model.zip", (frames, targets), (frames, targets), arguments)
+    unrelated = (frames, th.randn(targets.shape) * targets.std(dim=0) + targets.mean(dim=0))
+    held_out = (frames, unrelated[1][th.randperm(len(frames))])
+    assert told["error_cm"] < 0.5 * encoders.probe(tmp_path / "model.zip", unrelated, held_out, arguments)["error_cm"]

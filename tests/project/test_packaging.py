@@ -1,0 +1,145 @@
+"""What is installed is what is imported, and a machine that cannot run it is told so."""
+
+import ast
+import configparser
+import os
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from sb3_por import ALGORITHMS
+from softbody_envs import ENV_IDS
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("sb3_por", "softbody_envs")
+
+#: import name -> distribution, where they differ
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "sb3_contrib": "sb3-contrib", "yaml": "pyyaml"}
+
+
+@pytest.fixture(scope="module")
+def options():
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    return config
+
+
+def names(text):
+    return [line for line in text.splitlines() if line and not line.startswith("#")]
+
+
+def canonical(name):
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def requirements(text):
+    return {canonical(requirement.name): requirement for requirement in map(Requirement, names(text))}
+
+
+def test_every_package_is_listed(options):
+    listed = set(names(options["options"]["packages"]))
+    found = {
+        str(file.parent.relative_to(ROOT)).replace("/", ".") for p in PACKAGES for file in (ROOT / p).rglob("__init__.py")
+    }
+    yaml_folders = {"sb3_por.zoo_hyperparams", "sb3_por.zoo_hyperparams.paper"}
+    assert listed == found | yaml_folders
+
+
+def test_every_import_is_a_declared_dependency(options):
+    declared = set(requirements(options["options"]["install_requires"])) | set(
+        requirements(options["options.extras_require"]["ray"])
+    )
+    imported = set()
+    for file in (file for package in PACKAGES for file in (ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                imported.add(node.module.partition(".")[0])
+    foreign = imported - set(sys.stdlib_module_names) - set(PACKAGES)
+    # pybullet_utils and eglRenderer come in pybullet's wheel.
+    foreign -= {"pybullet_utils"}
+    assert {canonical(DISTRIBUTIONS.get(name, name)) for name in foreign} <= {canonical(name) for name in declared}
+
+
+def test_constraints_pin_what_is_declared_within_its_range(options):
+    pinned = requirements((ROOT / "constraints.txt").read_text())
+    extras = options["options.extras_require"]
+    declared = requirements("\n".join([options["options"]["install_requires"], extras["test"], extras["dev"]]))
+    assert set(declared) <= set(pinned)
+    for name, requirement in declared.items():
+        (pin,) = pinned[name].specifier
+        assert pin.operator == "==" and requirement.specifier.contains(pin.version), name
+
+
+def test_a_wheel_holds_the_hyperparameters_and_the_page_and_finds_them(tmp_path, options):
+    """Installed without -e, away from the checkout."""
+    source = tmp_path / "source"
+    files = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True
+    ).stdout.split("\0")
+    for name in filter(None, files):
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, source / name)
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", tmp_path, source]
+    subprocess.run(command, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("sb3_por-*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "installed")
+    installed = {path.name for path in (tmp_path / "installed" / "sb3_por" / "zoo_hyperparams").glob("*.yml")}
+    assert installed == {path.name for path in (ROOT / "zoo_hyperparams").glob("*.yml")}
+    assert (tmp_path / "installed" / "sb3_por" / "analysis" / "report.html.jinja").is_file()
+    script = "from sb3_por.training.zoo import hyperparameter_file as f; print(f('sac_por', 'PourWater-v0'))"
+    shown = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "installed")},
+        capture_output=True,
+        text=True,
+    )
+    assert shown.stdout.strip() == str(tmp_path / "installed/sb3_por/zoo_hyperparams/sac_por.yml"), shown.stderr
+
+
+def test_make_refuses_an_interpreter_without_pybullet_wheels(tmp_path):
+    python = tmp_path / "python3.12"
+    python.write_text("#!/bin/sh\nexit 1\n")  # what the Makefile's check of a version answers
+    python.chmod(0o755)
+    for interpreter in (str(python), ""):
+        done = subprocess.run(
+            ["make", "train", f"VENV={tmp_path}/venv", f"PYTHON={interpreter}"], cwd=ROOT, capture_output=True, text=True
+        )
+        assert done.returncode == 2
+        assert "make: Python 3.10 or 3.11 is needed (pybullet has wheels for no other)" in done.stderr
+        assert not (tmp_path / "venv").exists()
+
+
+def test_make_installs_once(tmp_path):
+    """An up-to-date stamp means nothing to do; a newer setup.cfg means an installation."""
+    (tmp_path / "venv" / "bin").mkdir(parents=True)
+    (tmp_path / "venv" / "bin" / "pip").touch()
+    stamp = tmp_path / "venv" / ".installed-test"
+    command = ["make", "-n", "train", f"VENV={tmp_path}/venv", "ARGS=-n 5"]
+    # Without what a make that runs these tests tells the makes below it.
+    env = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
+    fresh = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True).stdout
+    assert "pip install -q -c constraints.txt -e '.[test]'" in fresh
+    stamp.touch()
+    again = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True).stdout
+    assert again.strip() == f"{tmp_path}/venv/bin/python train.py --algo sac_por --env PourWater-v0 -n 5"
+
+
+def test_the_readme_lists_every_task_and_algorithm():
+    rows = re.findall(r"^\| `([^`]+)` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert set(rows) == {*ENV_IDS, *ALGORITHMS, "sac"}
+
+
+def test_the_readme_begins_with_the_two_commands():
+    text = (ROOT / "README.md").read_text()
+    assert 0 <= text.index("make train") < text.index("make test") < text.index("make demo") < 1500

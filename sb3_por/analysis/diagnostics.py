@@ -125,15 +125,13 @@ def diagnose(
     finally:
         env.close()
 
-    batches = [_sample(model, own) for _ in range(N_BATCHES)]
-    views = [model._preparation.views(batch) for batch in batches]
+    batches = [model.sample(BATCH_SIZE, own) for _ in range(N_BATCHES)]
+    measured = [model.objective_metrics(batch) for batch in batches]
+    leaks = [model.control_metrics(batch) for batch in batches]
+    at_random = [model.objective_metrics(model.sample(BATCH_SIZE, random)) for _ in range(N_BATCHES)]
+    norms = model.encoder_grad_norms(model.losses(batches[0]))
     with th.no_grad():
-        measured = [objective.loss(view)[1] for view in views]
-        leaks = [objective.control(model._preparation.control_views(batch)) for batch in batches]
-        features = th.cat([view.online("obs") for view in views])
-        at_random = [objective.loss(model._preparation.views(_sample(model, random)))[1] for _ in range(N_BATCHES)]
-    ent_coef = model.ent_coef_tensor if model.log_ent_coef is None else model.log_ent_coef.detach().exp()
-    norms = model._encoder_grad_norms(*model._encoder_losses(batches[0], model._preparation.views(batches[0]), ent_coef))
+        features = th.cat([model.critic.encode(batch.observations) for batch in batches])
     changing = [value for value in correlations if not np.isnan(value)]
     return Diagnosis(
         loss=_mean(measured, "loss"),
@@ -225,11 +223,6 @@ def _correlation(model: Any, frames: list[Any], monotone: np.ndarray) -> float:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConstantInputWarning)
         return float(spearmanr(potential, monotone).statistic)
-
-
-def _sample(model: Any, buffer: SequenceReplayBuffer) -> Any:
-    objective = model.policy.objective
-    return buffer.sample(BATCH_SIZE, model._vec_normalize_env, objective.future, objective.past, objective.window)
 
 
 def _mean(metrics: list[dict[str, th.Tensor]], name: str) -> float:

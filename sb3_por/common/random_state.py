@@ -4,17 +4,13 @@ import io
 import pathlib
 import random
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm as Algorithm
-else:
-    Algorithm = object
 
 
 def get_rng_state(action_space: spaces.Space) -> dict[str, Any]:
@@ -44,7 +40,7 @@ def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
     action_space.np_random.bit_generator.state = state["action_space"]
 
 
-class SavedRandomness(Algorithm):
+class SavedRandomState(OffPolicyAlgorithm):
     """
     A mixin for SB3's algorithms, which saves the states of the random generators with the model. A loaded model that goes on
     with ``learn(reset_num_timesteps=False)`` takes them up.

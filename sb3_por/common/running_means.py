@@ -3,7 +3,7 @@
 import torch as th
 
 
-class Means:
+class RunningMeans:
     """Running means of named scalars; what they hold does not grow with the number of values."""
 
     def __init__(self) -> None:

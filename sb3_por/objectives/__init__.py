@@ -1,8 +1,8 @@
 """Auxiliary objectives: losses that train an encoder beside the critic's."""
 
-from sb3_por.objectives.base import Objective
+from sb3_por.objectives.base import EncodedBatch, Objective
 from sb3_por.objectives.curl import Contrastive
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.objectives.spr import SelfPredictive
 
-__all__ = ["Contrastive", "Objective", "PartialOrder", "SelfPredictive"]
+__all__ = ["Contrastive", "EncodedBatch", "Objective", "PartialOrder", "SelfPredictive"]

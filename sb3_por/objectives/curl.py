@@ -1,11 +1,10 @@
-"""Contrastive representation (CURL, https://arxiv.org/abs/2004.04136): recognise a frame under another augmentation."""
+"""Contrastive representation (CURL, https://arxiv.org/abs/2004.04136): recognize a frame under another augmentation."""
 
 import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_por.objectives.base import Objective
-from sb3_por.visual.views import Views
+from sb3_por.objectives.base import EncodedBatch, Objective
 
 
 class Contrastive(Objective):
@@ -27,12 +26,13 @@ class Contrastive(Objective):
         super().__init__(features_dim, action_dim)
         self.weight = nn.Parameter(th.rand(features_dim, features_dim))
 
-    def loss(self, views: Views) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    def loss(self, batch: EncodedBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
-        :param views: The frames of the batch, among them ``"obs"`` and ``"positive"``
-        :return: The cross entropy (chance is the logarithm of the batch size), and how often the pick is right
+        :param batch: Encoded frames, with ``positive``
+        :return: The cross entropy (chance is the logarithm of the batch size), and the accuracy of the pick
         """
-        logits = views.online("obs") @ self.weight @ views.momentum("positive").T
+        assert batch.positive is not None
+        logits = batch.present @ self.weight @ batch.positive.T
         labels = th.arange(len(logits), device=logits.device)
         loss = F.cross_entropy(logits, labels)
         accuracy = (logits.argmax(dim=1) == labels).float().mean()

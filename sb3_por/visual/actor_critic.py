@@ -1,127 +1,85 @@
-"""The training step that the visual algorithms share: critic and objective train the encoder, then the actor follows."""
+"""One update of the visual algorithms: critic and objective train the encoder, then the actor follows (Algorithm 1)."""
 
 import warnings
 from abc import ABC, abstractmethod
-from contextlib import nullcontext
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
+from stable_baselines3.common.type_aliases import MaybeCallback, PyTorchObs
 from stable_baselines3.common.utils import polyak_update, update_learning_rate
-from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_por.acceleration.allocator import keep_freed_memory
-from sb3_por.acceleration.compile import CompiledNetworks
-from sb3_por.acceleration.overlap import OverlappedEnv
+from sb3_por.acceleration.overlap import OverlappedTraining
 from sb3_por.acceleration.precision import check_precision
-from sb3_por.acceleration.transfer import without_waiting
-from sb3_por.common.random_state import SavedRandomness
-from sb3_por.common.running_means import Means
+from sb3_por.acceleration.updates import AcceleratedUpdates
+from sb3_por.common.random_state import SavedRandomState
+from sb3_por.common.running_means import RunningMeans
 from sb3_por.objectives.base import Objective
-from sb3_por.visual.preparation import Preparation
+from sb3_por.visual.batch import Augmentation, Frames, encode, repeat, take
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
-from sb3_por.visual.views import Views
 
 
-class VisualActorCritic(SavedRandomness, ABC):
+class Losses(NamedTuple):
     """
-    A mixin for SB3's off-policy actor-critics (SAC, TQC). It takes their arguments, in their order, and the keyword
-    arguments below; ``VisualSAC`` documents all of them.
+    The losses of one batch that train the encoder, and what the actor's update uses again.
 
-    One update: encode each frame once per encoder; critic loss + coefficient * objective loss, one backward, one
-    optimizer step over encoder, critic and objective (two, for objectives with an optimizer of their own); actor and
-    temperature on the detached trunk features; moving averages last.
-
-    :param encoder_tau: tau of the momentum encoder; ``encoder_tau_ratio`` times that of the Q networks (``tau``) by default
-    :param actor_update_interval: Update actor and temperature every that many updates
-    :param target_update_interval: Update the target networks every that many updates (SB3 counts within one call of
-        ``train()``, SB3 #2158)
-    :param ent_coef_lr_ratio: Learning rate of the temperature, in units of ``learning_rate``
-    :param reward_scale: Factor on the rewards in the critic's target
-    :param start_at_mean_reward: Let values begin at what the mean reward would be worth for ever, instead of at 0
-    :param augmentation_pad: Random shift of images, in pixels; 0 for none
-    :param n_augmentations: DrQ's M: augmentations of o_t whose critic losses are averaged
-    :param n_target_augmentations: DrQ's K: augmentations of o_{t+1} whose targets are averaged
-    :param diagnostics_interval: Log the objective's control and the losses' gradient norms every that many updates
-    :param overlap: Train while the environments make the next step, which pays with worker processes
-        (``SubprocVecEnv``). Updates that are due after a rollout are made in the first step of the next one, always
-        between sending the actions and waiting for the results, so that runs stay reproducible
-    :param precision: Of the updates: ``"float32"``, ``"tf32"`` (matrix products and convolutions of a GPU that has it;
-        a setting of the whole process), or ``"bfloat16"`` (trunks only: Q values and probabilities need more)
-    :param compile_mode: Compile the networks with this mode of ``torch.compile``, for example ``"default"`` or
-        ``"reduce-overhead"`` (CUDA graphs); None for none
+    :param critic: L_RL, a scalar
+    :param objective: lambda * L_objective, a scalar; 0 without an objective
+    :param metrics: Detached scalars of the objective, to log
+    :param present: First augmentation of o_t, preprocessed
+    :param trunk_t: The critic's trunk features of it, detached, shape ``(batch, trunk_dim)``
     """
 
-    #: How much faster the momentum encoder follows than the Q networks, unless it is told.
+    critic: th.Tensor
+    objective: th.Tensor
+    metrics: dict[str, th.Tensor]
+    present: PyTorchObs
+    trunk_t: th.Tensor
+
+
+class VisualActorCritic(OverlappedTraining, SavedRandomState, ABC):
+    """
+    A mixin for SB3's off-policy actor-critics (SAC, TQC). One update: encode each frame once per encoder; critic loss +
+    lambda * objective loss, one backward pass, one optimizer step over encoder, critic and objective (two steps, for
+    objectives with an optimizer of their own); actor and temperature on the detached trunk features; moving averages last.
+
+    A subclass says how its critic measures values: ``_next_values``, ``_critic_loss`` and ``_actor_values``.
+    """
+
+    #: The auxiliary objective; None for none
+    objective_class: ClassVar[type[Objective] | None] = None
+    #: Default of ``encoder_tau``, in units of ``tau``
     encoder_tau_ratio: ClassVar[float] = 1.0
-    #: Learning rate of an objective that has an optimizer of its own, in units of ``learning_rate``.
+
+    #: Learning rate of an objective that has an optimizer of its own, in units of ``learning_rate``
     aux_lr_ratio: float = 1.0
+
+    # Set by the subclass's constructor, which documents them
+    encoder_tau: float | None
+    actor_update_interval: int
+    ent_coef_lr_ratio: float
+    reward_scale: float
+    start_at_mean_reward: bool
+    augmentation_pad: int
+    n_augmentations: int
+    n_target_augmentations: int
+    diagnostics_interval: int
+    precision: str
+    compile_mode: str | None
 
     # What SAC and TQC have in common
     policy: Any
     actor: Any
+    replay_buffer: Any
     critic: Any
     critic_target: Any
-    replay_buffer: Any
     ent_coef_optimizer: Any
     log_ent_coef: Any
     ent_coef_tensor: th.Tensor
-    tau: float
     target_entropy: Any
     target_update_interval: int
     batch_norm_stats: list[th.Tensor]
     batch_norm_stats_target: list[th.Tensor]
-
-    def __init__(
-        self,
-        policy: Any,
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        buffer_size: int = 100_000,
-        learning_starts: int = 100,
-        batch_size: int = 128,
-        *args: Any,
-        encoder_tau: float | None = None,
-        actor_update_interval: int = 1,
-        target_update_interval: int = 1,
-        ent_coef_lr_ratio: float = 1.0,
-        reward_scale: float = 1.0,
-        start_at_mean_reward: bool = False,
-        augmentation_pad: int = 4,
-        n_augmentations: int = 1,
-        n_target_augmentations: int = 1,
-        diagnostics_interval: int = 200,
-        overlap: bool = False,
-        precision: str = "float32",
-        compile_mode: str | None = None,
-        **kwargs: Any,
-    ):
-        check_precision(precision)
-        self.precision = precision
-        self.compile_mode = compile_mode
-        self.encoder_tau = encoder_tau
-        self.actor_update_interval = actor_update_interval
-        self.ent_coef_lr_ratio = ent_coef_lr_ratio
-        self.reward_scale = reward_scale
-        self.start_at_mean_reward = start_at_mean_reward
-        self.augmentation_pad = augmentation_pad
-        self.n_augmentations = n_augmentations
-        self.n_target_augmentations = n_target_augmentations
-        self.diagnostics_interval = diagnostics_interval
-        self.overlap = overlap
-        self._defer, self._updates_due = False, 0
-        self._metrics = Means()
-        kwargs["target_update_interval"] = target_update_interval
-        super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, *args, **kwargs)
-        if start_at_mean_reward and self.gamma >= 1.0:
-            raise ValueError("start_at_mean_reward needs gamma < 1: a reward that goes on for ever has no finite value")
-
-    def _objective(self) -> tuple[type[Objective] | None, dict[str, Any]]:
-        """
-        :return: Class and keyword arguments of the auxiliary objective; None for none
-        """
-        return None, {}
 
     @property
     def objective_coef(self) -> float:
@@ -130,66 +88,22 @@ class VisualActorCritic(SavedRandomness, ABC):
         """
         return 1.0
 
-    def _setup_model(self) -> None:
-        objective_class, objective_kwargs = self._objective()
-        if objective_class is not None:
-            self.policy_kwargs = dict(self.policy_kwargs, objective_class=objective_class, objective_kwargs=objective_kwargs)
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = SequenceReplayBuffer
-        if issubclass(self.replay_buffer_class, SequenceReplayBuffer):
-            self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs, n_steps=self.n_steps, gamma=self.gamma)
-        with warnings.catch_warnings():
-            if issubclass(self.replay_buffer_class, SequenceReplayBuffer):
-                # SB3 knows its own buffers only
-                warnings.filterwarnings("ignore", message="`n_steps=")
-            super()._setup_model()
-        if isinstance(self.replay_buffer, SequenceReplayBuffer):
-            # Set, it would make SB3 end the episode that a second learn() cuts off
-            self.optimize_memory_usage = False
-        self._check_buffer()
-        if self.device.type == "cpu":
-            keep_freed_memory()
-        if self.precision == "tf32":
-            th.set_float32_matmul_precision("high")
-            th.backends.cudnn.allow_tf32 = True
-        self._compiled = None if self.compile_mode is None else CompiledNetworks(self.policy, self.compile_mode)
-        self._metrics = Means()
-        self._preparation = Preparation(
-            self.policy,
-            self.augmentation_pad,
-            self.n_augmentations,
-            self.n_target_augmentations,
-            bfloat16=self.precision == "bfloat16",
-        )
-
-    def _check_buffer(self) -> None:
-        """The objective needs frames that only some buffers can sample."""
-        objective = self.policy.objective
-        buffer = self.replay_buffer
-        if objective is None or isinstance(buffer, SequenceReplayBuffer):
-            return
-        next_is_future = not (isinstance(buffer, NStepReplayBuffer) and buffer.n_steps > 1)
-        has_future = objective.future is None or (objective.future == (1, 1) and next_is_future)
-        if objective.window > 0 or not has_future:
-            raise ValueError(
-                f"{type(buffer).__name__} cannot sample the later frames that {type(self).__name__} needs with these "
-                "settings: use the default replay_buffer_class, SequenceReplayBuffer."
-            )
+    # -- what a subclass says -------------------------------------------------------------------------------------
 
     @abstractmethod
     def _next_values(self, features: th.Tensor, actions: th.Tensor, entropy_term: th.Tensor) -> th.Tensor:
         """
-        :param features: f_m of the next observations, shape ``(batch, features_dim)``
+        :param features: f_m of the next observations, shape ``(rows, features_dim)``
         :param actions: The actor's actions there
-        :param entropy_term: Temperature times the log probability of these actions, shape ``(batch, 1)``
-        :return: Values of the next observations, shape ``(batch, 1 or number of quantiles)``
+        :param entropy_term: Temperature times the log probability of these actions, shape ``(rows, 1)``
+        :return: Values of the next observations, shape ``(rows, 1 or number of quantiles)``
         """
 
     @abstractmethod
     def _critic_loss(self, features: th.Tensor, actions: th.Tensor, target: th.Tensor) -> th.Tensor:
         """
-        :param features: f_o of the observations, shape ``(batch, features_dim)``
-        :param actions: Actions from the replay buffer
+        :param features: f_o of the observations, shape ``(rows, features_dim)``
+        :param actions: Actions from the replay buffer, shape ``(rows, action_dim)``
         :param target: Target of the critic, shaped as ``_next_values`` returns it
         :return: The critic's loss, a scalar
         """
@@ -202,13 +116,14 @@ class VisualActorCritic(SavedRandomness, ABC):
         :return: Values that the actor maximizes, shape ``(batch, 1)``
         """
 
+    # -- one update -----------------------------------------------------------------------------------------------
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """
         :param gradient_steps: Number of updates
         :param batch_size: Transitions per update
         """
-        if self._defer:
-            self._defer, self._updates_due = False, self._updates_due + gradient_steps
+        if self._defer(gradient_steps):
             return
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
@@ -219,10 +134,9 @@ class VisualActorCritic(SavedRandomness, ABC):
         if self.policy.objective_optimizer is not None:
             update_learning_rate(self.policy.objective_optimizer, self.aux_lr_ratio * learning_rate)
 
-        compiled = nullcontext() if self._compiled is None else self._compiled.in_place()
-        with without_waiting(self.device), compiled:
-            for _ in range(gradient_steps):
-                self._n_updates += 1
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            with self._acceleration.update():
                 self._update(batch_size)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -233,115 +147,85 @@ class VisualActorCritic(SavedRandomness, ABC):
         """
         :param batch_size: Transitions of this update
         """
-        if self.compile_mode is not None:
-            # CUDA graphs keep what they return until the next update: trunk features are used again
-            th.compiler.cudagraph_mark_step_begin()
-        replay_data = self._sample(batch_size)
+        batch = self.sample(batch_size)
         if self.use_sde:
             # log_std may have changed since the last update
             self.actor.reset_noise()
         if self.start_at_mean_reward and self._n_updates == 1:
-            self._start_values(replay_data)
-        views = self._preparation.views(replay_data)
-        ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
-        critic_loss, objective_loss = self._encoder_losses(replay_data, views, ent_coef)
-        self._diagnose(replay_data, critic_loss, objective_loss)
-        self._update_encoder(critic_loss, objective_loss)
+            self._start_values(batch)
+        losses = self.losses(batch)
+        self._metrics.add("ent_coef", self.temperature)
+        self._metrics.add("critic_loss", losses.critic)
+        if self.policy.objective is not None:
+            self._log_objective(losses.metrics)
+            if self._n_updates % self.diagnostics_interval == 0:
+                self._log_diagnostics(batch, losses)
 
+        self._step_encoder(losses)
         if self._n_updates % self.actor_update_interval == 0:
-            self._update_actor(views, ent_coef)
+            self._step_actor(losses)
         # After the encoder's step, so that the targets' batch norm statistics are the current ones
         if self._n_updates % self.target_update_interval == 0:
             self._update_targets()
 
-        self._metrics.add("ent_coef", ent_coef)
-        self._metrics.add("critic_loss", critic_loss)
+    def losses(self, batch: Any) -> Losses:
+        """
+        :param batch: Samples of the replay buffer
+        :return: L_RL and lambda * L_objective
+        """
+        objective, batch_size = self.policy.objective, len(batch.actions)
+        # Every frame is augmented independently. M augmentations of o_t and K of o_{t+1} are rows of one batch (DrQ)
+        frames = self._augmentation.frames(batch, objective, self.n_augmentations, self.n_target_augmentations)
 
-    def _update_encoder(self, critic_loss: th.Tensor, objective_loss: th.Tensor) -> None:
-        """One step of critic, encoder and objective, or one for each loss."""
+        # s_t = f_o(o_t) with gradient, s_{t+1} = f_m(o_{t+1}) without
+        trunk_t = self.critic.trunk(frames.present)
+        s_t = self.critic.projection(trunk_t)
+        with th.no_grad():
+            s_next = self.critic_target.features(frames.next)
+
+        # lambda * L_objective
+        objective_loss, metrics = s_t.new_zeros(()), {}
+        if objective is not None:
+            encoded = encode(frames, batch, objective, s_t[:batch_size], s_next[:batch_size], self.policy)
+            loss, metrics = objective.loss(encoded)
+            objective_loss = self.objective_coef * loss
+
+        # L_RL: the target is the mean over the K augmentations, the loss that over the M
+        with th.no_grad():
+            next_actions, next_log_prob = self.actor.action_log_prob_of(self._actor_trunk(frames.next))
+            next_values = self._next_values(s_next, next_actions, self.temperature * next_log_prob)
+            next_values = next_values.unflatten(0, (-1, batch_size)).mean(dim=0)
+            target = self.reward_scale * batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
+        m = self.n_augmentations
+        critic_loss = self._critic_loss(s_t, repeat(batch.actions, m), repeat(target, m))
+        return Losses(critic_loss, objective_loss, metrics, take(frames.present, batch_size), trunk_t[:batch_size].detach())
+
+    def _step_encoder(self, losses: Losses) -> None:
+        """One step of critic, encoder and objective on the sum of the losses, or one step for each loss."""
         own_optimizer = self.policy.objective_optimizer
         self.critic.optimizer.zero_grad()
         if own_optimizer is None:
-            (critic_loss + objective_loss).backward()
+            (losses.critic + losses.objective).backward()
             self.critic.optimizer.step()
             return
         parameters = [parameter for group in own_optimizer.param_groups for parameter in group["params"]]
         # Before the critic's step changes what this gradient was computed with
-        gradients = th.autograd.grad(objective_loss, parameters, retain_graph=True, allow_unused=True)
-        critic_loss.backward()
+        gradients = th.autograd.grad(losses.objective, parameters, retain_graph=True, allow_unused=True)
+        losses.critic.backward()
         self.critic.optimizer.step()
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         own_optimizer.step()
 
-    def _encoder_losses(self, replay_data: Any, views: Views, ent_coef: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """L_RL and lambda * L_objective: the two losses that train the encoder."""
-        for name in self._preparation.next_names:
-            # All rows at once, before the objective asks for some of them
-            views.momentum(name)
-        objective_loss = self._objective_loss(views)
-        discounts = self._discounts(replay_data)
-        with th.no_grad():
-            next_values = [self._value_of(views, name, ent_coef) for name in self._preparation.next_names]
-            target = self.reward_scale * replay_data.rewards
-            target = target + (1 - replay_data.dones) * discounts * sum(next_values) / len(next_values)
-        critic_losses = [
-            self._critic_loss(views.online(name), replay_data.actions, target) for name in self._preparation.obs_names
-        ]
-        return th.stack(critic_losses).mean(), objective_loss
-
-    def _discounts(self, replay_data: Any) -> th.Tensor | float:
-        """gamma, or for n-step replay gamma**n_steps (when no early termination)."""
-        return replay_data.discounts if replay_data.discounts is not None else self.gamma
-
-    def _start_values(self, replay_data: Any) -> None:
-        """Move the last biases of all Q networks by the value of this batch's mean reward."""
-        reward = self.reward_scale * replay_data.rewards.mean()
-        goes_on = ((1 - replay_data.dones) * self._discounts(replay_data)).mean()
-        with th.no_grad():
-            for head in [*self.critic.q_networks, *self.critic_target.q_networks]:
-                head[-1].bias += reward / (1 - goes_on)
-
-    def _sample(self, batch_size: int) -> Any:
-        """A batch from the replay buffer with what the objective asks for."""
-        normalizer = self._vec_normalize_env
-        if not isinstance(self.replay_buffer, SequenceReplayBuffer):
-            return self.replay_buffer.sample(batch_size, env=normalizer)
-        objective = self.policy.objective
-        if objective is None:
-            return self.replay_buffer.sample(batch_size, env=normalizer)
-        # One step later is next_observations already
-        future = None if objective.future == (1, 1) and self.n_steps == 1 else objective.future
-        return self.replay_buffer.sample(batch_size, normalizer, future, objective.past, objective.window)
-
-    def _objective_loss(self, views: Views) -> th.Tensor:
-        """The objective's weighted loss."""
-        objective = self.policy.objective
-        if objective is None:
-            return th.zeros((), device=self.device)
-        loss, metrics = objective.loss(views)
-        self._log_objective(metrics)
-        return self.objective_coef * loss
-
-    def _log_objective(self, metrics: dict[str, th.Tensor]) -> None:
-        for name, value in metrics.items():
-            self._metrics.add(f"{self.policy.objective.name}_{name}", value)
-
-    def _actor_input(self, views: Views, name: str) -> th.Tensor:
-        """Trunk features for the actor: the critic's, detached, unless the actor has a trunk of its own."""
-        return views.trunk(name) if self.actor.detach_trunk else views.trunk_of(self.actor, views.frames[name])
-
-    def _value_of(self, views: Views, name: str, ent_coef: th.Tensor) -> th.Tensor:
-        """Value of one augmentation of the next observations under the target critic."""
-        actions, log_prob = self.actor.action_log_prob_of(self._actor_input(views, name))
-        return self._next_values(views.momentum(name), actions, ent_coef * log_prob)
-
-    def _update_actor(self, views: Views, ent_coef: th.Tensor) -> None:
+    def _step_actor(self, losses: Losses) -> None:
         """One step of actor and temperature. No gradient reaches critic and encoder."""
-        actions, log_prob = self.actor.action_log_prob_of(self._actor_input(views, "obs"))
+        # The encoder has changed since its loss, the trunk's features are those of before
+        trunk = losses.trunk_t if self.actor.detach_trunk else self.actor.trunk(losses.present)
+        actions, log_prob = self.actor.action_log_prob_of(trunk)
         with th.no_grad():
-            features = self.critic.projection(views.trunk("obs"))
-        actor_loss = (ent_coef * log_prob - self._actor_values(features, actions)).mean()
+            features = self.critic.projection(losses.trunk_t)
+        temperature = self.temperature
+        actor_loss = (temperature * log_prob - self._actor_values(features, actions)).mean()
         self.actor.optimizer.zero_grad()
         # Named inputs: the critic's weights get no gradient, and none is computed for them
         actor_loss.backward(inputs=[p for group in self.actor.optimizer.param_groups for p in group["params"]])
@@ -356,13 +240,6 @@ class VisualActorCritic(SavedRandomness, ABC):
             self.ent_coef_optimizer.step()
             self._metrics.add("ent_coef_loss", ent_coef_loss)
 
-    @property
-    def momentum_tau(self) -> float:
-        """
-        :return: tau of the momentum encoder: ``encoder_tau``, or what follows from ``tau`` as it is now
-        """
-        return min(self.encoder_tau_ratio * self.tau, 1.0) if self.encoder_tau is None else self.encoder_tau
-
     def _update_targets(self) -> None:
         """theta_m <- tau theta_o + (1 - tau) theta_m for encoder and Q networks, each with its tau."""
         polyak_update(self.critic.encoder_parameters(), self.critic_target.encoder_parameters(), self.momentum_tau)
@@ -372,28 +249,104 @@ class VisualActorCritic(SavedRandomness, ABC):
         # Copy running stats, see SB3 #996
         polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
-    def _diagnose(self, replay_data: Any, critic_loss: th.Tensor, objective_loss: th.Tensor) -> None:
-        """Now and then: the objective's control, and how hard each loss pulls at the encoder."""
-        objective = self.policy.objective
-        if objective is None or self._n_updates % self.diagnostics_interval != 0:
-            return
-        for name, norm in self._encoder_grad_norms(critic_loss, objective_loss).items():
-            self._metrics.add(f"encoder_grad_norm_{name}", norm)
-        with th.no_grad():
-            self._log_objective(objective.control(self._preparation.control_views(replay_data)))
+    @property
+    def momentum_tau(self) -> float:
+        """
+        :return: tau of the momentum encoder: ``encoder_tau``, or what follows from ``tau`` as it is now
+        """
+        return min(self.encoder_tau_ratio * self.tau, 1.0) if self.encoder_tau is None else self.encoder_tau
 
-    def _encoder_grad_norms(self, critic_loss: th.Tensor, objective_loss: th.Tensor) -> dict[str, th.Tensor]:
-        """How hard each loss pulls at the encoder; keeps the graph."""
+    @property
+    def temperature(self) -> th.Tensor:
+        """
+        :return: Entropy coefficient, a scalar without gradient
+        """
+        return self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
+
+    def _discounts(self, batch: Any) -> th.Tensor | float:
+        """gamma, or gamma**n for n-step replay (n is smaller at the end of an episode)."""
+        return batch.discounts if batch.discounts is not None else self.gamma
+
+    def _actor_trunk(self, frames: PyTorchObs) -> th.Tensor:
+        """Trunk features for the actor: those of the critic's trunk, unless the actor has a trunk of its own."""
+        return (self.critic if self.actor.detach_trunk else self.actor).trunk(frames)
+
+    def _start_values(self, batch: Any) -> None:
+        """Move the last biases of all Q networks by the value of this batch's mean reward."""
+        reward = self.reward_scale * batch.rewards.mean()
+        continues = ((1 - batch.dones) * self._discounts(batch)).mean()
+        with th.no_grad():
+            for head in [*self.critic.q_networks, *self.critic_target.q_networks]:
+                head[-1].bias += reward / (1 - continues)
+
+    # -- measurements ---------------------------------------------------------------------------------------------
+
+    def sample(self, batch_size: int, replay_buffer: Any = None) -> Any:
+        """
+        :param batch_size: Number of transitions
+        :param replay_buffer: Buffer to sample from; the model's own by default
+        :return: Samples with the frames that the objective uses
+        """
+        buffer = self.replay_buffer if replay_buffer is None else replay_buffer
+        normalizer, objective = self._vec_normalize_env, self.policy.objective
+        if objective is None or not isinstance(buffer, SequenceReplayBuffer):
+            return buffer.sample(batch_size, env=normalizer)
+        # One step later is next_observations already
+        future = None if objective.future == (1, 1) and self.n_steps == 1 else objective.future
+        return buffer.sample(batch_size, normalizer, future, objective.past, objective.window)
+
+    def objective_metrics(self, batch: Any) -> dict[str, th.Tensor]:
+        """
+        :param batch: From ``sample()``
+        :return: The objective's metrics on freshly augmented frames of the batch
+        """
+        with th.no_grad():
+            return self.losses(batch).metrics
+
+    def control_metrics(self, batch: Any) -> dict[str, th.Tensor]:
+        """
+        :param batch: From ``sample()``
+        :return: The objective's metrics on o_t in the place of all frames, augmented independently: no time passes there
+        """
+        with th.no_grad():
+            augment, o_t = self._augmentation, batch.observations
+            # Where the replay buffer can go back, o_t stands for the past, too
+            has_past = getattr(batch, "past_observations", None) is not None
+            frames = Frames(
+                present=augment(o_t),
+                next=augment(o_t),
+                past=augment(take(o_t, len(batch.actions) // 2)) if has_past else None,
+            )
+            s_t, s_next = self.critic.features(frames.present), self.critic_target.features(frames.next)
+            return self.policy.objective.control(encode(frames, batch, self.policy.objective, s_t, s_next, self.policy))
+
+    def encoder_grad_norms(self, losses: Losses) -> dict[str, th.Tensor]:
+        """
+        :param losses: Losses of one batch; their graph is kept
+        :return: Norm of the gradient of each loss with respect to the encoder, by the name of the loss
+        """
         parameters = self.critic.encoder_parameters()
         norms = {}
-        for name, loss in (("critic", critic_loss), (self.policy.objective.name, objective_loss)):
+        for name, loss in (("critic", losses.critic), (self.policy.objective.name, losses.objective)):
             gradients = th.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
             parts = [gradient.norm() for gradient in gradients if gradient is not None]
             norms[name] = th.stack(parts).norm() if parts else loss.new_zeros(())
         return norms
 
+    # -- logging --------------------------------------------------------------------------------------------------
+
+    def _log_objective(self, metrics: dict[str, th.Tensor]) -> None:
+        for name, value in metrics.items():
+            self._metrics.add(f"{self.policy.objective.name}_{name}", value)
+
+    def _log_diagnostics(self, batch: Any, losses: Losses) -> None:
+        """Log the gradient norm of each loss with respect to the encoder, and the objective's control."""
+        for name, norm in self.encoder_grad_norms(losses).items():
+            self._metrics.add(f"encoder_grad_norm_{name}", norm)
+        self._log_objective(self.control_metrics(batch))
+
     def _record_metrics(self) -> None:
-        """Hand the means since the last time to the logger, which averages them until it writes: the one place that waits."""
+        """Hand the running means to the logger, which averages them until it writes. Nothing else waits for the device."""
         for name, mean in self._metrics.take().items():
             self.logger.record_mean(f"train/{name}", mean)
 
@@ -401,22 +354,48 @@ class VisualActorCritic(SavedRandomness, ABC):
         self._record_metrics()
         super().dump_logs()
 
-    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """See SB3. With ``overlap`` the updates that the last rollout left are made in the first step of this one."""
-        if not self.overlap:
-            return super().collect_rollouts(env, *args, **kwargs)
-        rollout = super().collect_rollouts(OverlappedEnv(env, self._train_due), *args, **kwargs)
-        # The updates that SB3 asks for next
-        self._defer = True
-        return rollout
+    # -- set-up, saving -------------------------------------------------------------------------------------------
 
-    def _train_due(self) -> None:
-        """Make the updates that are due; the policy goes on acting in evaluation mode."""
-        self._defer = False
-        if self._updates_due > 0:
-            updates, self._updates_due = self._updates_due, 0
-            self.train(updates, self.batch_size)
-            self.policy.set_training_mode(False)
+    def _setup_model(self) -> None:
+        check_precision(self.precision)
+        if self.start_at_mean_reward and self.gamma >= 1.0:
+            raise ValueError("start_at_mean_reward needs gamma < 1: without a discount, the sum of all rewards is infinite")
+        if self.objective_class is not None:
+            # The objective's arguments are attributes of the same names, so that load(path, k=3) changes them as in SB3
+            arguments = {name: getattr(self, name) for name in self.objective_class.arguments()}
+            self.policy_kwargs = dict(self.policy_kwargs, objective_class=self.objective_class, objective_kwargs=arguments)
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = SequenceReplayBuffer
+        own_buffer = issubclass(self.replay_buffer_class, SequenceReplayBuffer)
+        if own_buffer:
+            self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs, n_steps=self.n_steps, gamma=self.gamma)
+        with warnings.catch_warnings():
+            if own_buffer:
+                # SB3 knows its own buffers only
+                warnings.filterwarnings("ignore", message="`n_steps=")
+            super()._setup_model()
+        if own_buffer:
+            # If set, SB3 would end the episode that a second learn() cuts off
+            self.optimize_memory_usage = False
+        self._check_buffer()
+        self._acceleration = AcceleratedUpdates(self.policy, self.precision, self.compile_mode)
+        self._augmentation = Augmentation(self.policy, self.augmentation_pad)
+        self._metrics = RunningMeans()
+
+    def _check_buffer(self) -> None:
+        """
+        :raises ValueError: If the replay buffer cannot sample the frames that the objective uses
+        """
+        objective, buffer = self.policy.objective, self.replay_buffer
+        if objective is None or isinstance(buffer, SequenceReplayBuffer):
+            return
+        next_is_future = not (isinstance(buffer, NStepReplayBuffer) and buffer.n_steps > 1)
+        has_future = objective.future is None or (objective.future == (1, 1) and next_is_future)
+        if objective.window > 0 or not has_future:
+            raise ValueError(
+                f"{type(buffer).__name__} cannot sample the later frames that {type(self).__name__} needs with these "
+                "settings: use the default replay_buffer_class, SequenceReplayBuffer."
+            )
 
     def learn(
         self,
@@ -430,16 +409,14 @@ class VisualActorCritic(SavedRandomness, ABC):
         """
         :param total_timesteps: Number of environment steps
         :param callback: Called at every step
-        :param log_interval: Log every that many episodes
+        :param log_interval: Log every ``log_interval`` episodes
         :param tb_log_name: Name of the run in TensorBoard; the name of the class by default
-        :param reset_num_timesteps: Start counting from zero; False goes on, for a loaded model as if it had never stopped
+        :param reset_num_timesteps: Start counting from zero. False continues; a loaded model as if it had never stopped
         :param progress_bar: Show a progress bar
         :return: The model
         """
         name = type(self).__name__ if tb_log_name is None else tb_log_name
-        super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
-        self._train_due()
-        return self
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
@@ -447,4 +424,4 @@ class VisualActorCritic(SavedRandomness, ABC):
         return [*state_dicts, *own], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_preparation", "_compiled"]
+        return [*super()._excluded_save_params(), "_metrics", "_augmentation", "_acceleration"]

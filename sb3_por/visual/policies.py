@@ -1,13 +1,13 @@
 """Policies whose critic owns the encoder; the actor sees the detached trunk through a projection of its own."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from sb3_contrib.tqc.policies import Critic as QuantileCritic
 from sb3_contrib.tqc.policies import TQCPolicy
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BaseModel, BasePolicy, ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim, is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -85,12 +85,6 @@ class VisualActor(Actor):
         ]
 
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.policies import BasePolicy as Policy
-else:
-    Policy = object
-
-
 def with_layer_norm(network: nn.Sequential) -> nn.Sequential:
     """
     :param network: Linear layers with activations between them
@@ -104,7 +98,7 @@ def with_layer_norm(network: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-class EncoderOwner:
+class EncoderOwner(BaseModel):
     """
     A critic that owns an encoder: trunk (``features_extractor``) and ``projection`` together are f_o, and in the target
     critic f_m. A mixin for SB3's critics.
@@ -112,36 +106,43 @@ class EncoderOwner:
     :param layer_norm: The Q networks have layer norm
     """
 
+    features_extractor: BaseFeaturesExtractor
     q_networks: list[Any]
 
     def __init__(self, *args: Any, layer_norm: bool = False, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.projection = make_projection(self.features_extractor)  # type: ignore[attr-defined]
+        self.projection = make_projection(self.features_extractor)
         if layer_norm:
             self.q_networks = [with_layer_norm(network) for network in self.q_networks]
             for index, network in enumerate(self.q_networks):
                 setattr(self, f"qf{index}", network)
 
-    def trunk(self, observations: PyTorchObs) -> th.Tensor:
+    def trunk(self, frames: PyTorchObs) -> th.Tensor:
         """
-        :param observations: Preprocessed observations
+        :param frames: Preprocessed observations
         :return: Trunk features, shape ``(batch, trunk_dim)``
         """
-        return self.features_extractor(observations)  # type: ignore[attr-defined]
+        return self.features_extractor(frames)
+
+    def features(self, frames: PyTorchObs) -> th.Tensor:
+        """
+        :param frames: Preprocessed observations
+        :return: The encoder's features, shape ``(batch, features_dim)``
+        """
+        return self.projection(self.trunk(frames))
 
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """
-        :param obs: Observations as the environment gives them
+        :param obs: Observations as the environment returns them
         :return: The encoder's features, shape ``(batch, features_dim)``
         """
-        space, normalize = self.observation_space, self.normalize_images  # type: ignore[attr-defined]
-        return self.projection(self.trunk(preprocess_obs(obs, space, normalize_images=normalize)))
+        return self.features(preprocess_obs(obs, self.observation_space, normalize_images=self.normalize_images))
 
     def encoder_parameters(self) -> list[nn.Parameter]:
         """
         :return: Parameters of trunk and projection
         """
-        return [*self.features_extractor.parameters(), *self.projection.parameters()]  # type: ignore[attr-defined]
+        return [*self.features_extractor.parameters(), *self.projection.parameters()]
 
     def head_parameters(self) -> list[nn.Parameter]:
         """
@@ -187,7 +188,7 @@ class VisualQuantileCritic(EncoderOwner, QuantileCritic):
         return th.stack([q_network(q_input) for q_network in self.q_networks], dim=1)
 
 
-class VisualPolicy(Policy):
+class VisualPolicy(BasePolicy):
     """
     What the visual policies of SAC and TQC have in common. A mixin for SB3's policies; takes their arguments, with the
     encoder as default features extractor, and

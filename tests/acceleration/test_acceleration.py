@@ -43,12 +43,15 @@ def test_an_unknown_precision_is_named():
 def test_bfloat16_keeps_q_values_and_targets_exact():
     model = train(precision="bfloat16")
     batch = model.replay_buffer.sample(16)
-    views = model._preparation.views(batch)
-    assert model.critic.q_values(views.online("obs"), batch.actions)[0].dtype == th.float32
-    assert views.momentum("next").dtype == views.trunk("obs").dtype == th.float32
-    # The trunk alone is computed in lower precision
-    exact = model.critic.trunk(views.frames["obs"])
-    assert 0 < (views.trunk("obs") - exact).abs().max() < 0.1 * exact.abs().max()
+    frames = model._augmentation(batch.observations)
+    exact = model.critic.trunk(frames)
+    with model._acceleration.update():
+        trunk, features = model.critic.trunk(frames), model.critic_target.features(frames)
+        assert model.critic.q_values(model.critic.features(frames), batch.actions)[0].dtype == th.float32
+    assert features.dtype == trunk.dtype == th.float32
+    # The trunk alone is computed in lower precision, and in updates alone
+    assert 0 < (trunk - exact).abs().max() < 0.1 * exact.abs().max()
+    assert th.equal(model.critic.trunk(frames), exact)
 
 
 @pytest.mark.parametrize("cls", [SACPOR, SACDrQ])

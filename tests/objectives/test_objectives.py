@@ -9,19 +9,28 @@ from torch import nn
 from toy_envs import DotEnv
 
 from sb3_por import ALGORITHMS, SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualTQC
-from sb3_por.objectives import Contrastive, SelfPredictive
-from sb3_por.visual.views import Views
+from sb3_por.objectives import Contrastive, EncodedBatch, SelfPredictive
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
 
 class LinearEncoder(nn.Module):
-    """An owner of an encoder, as far as ``Views`` is concerned."""
+    """A trunk and a projection."""
 
     def __init__(self, in_dim, out_dim):
         super().__init__()
         self.trunk = nn.Linear(in_dim, out_dim)
         self.projection = nn.Sequential(nn.LayerNorm(out_dim), nn.Tanh())
+
+    def forward(self, frames):
+        return self.projection(self.trunk(frames))
+
+
+def encode(f_o, f_m, obs, positive=None, window=None, **actions):
+    """The batch of an objective from frames that are vectors."""
+    with th.no_grad():
+        others = {name: f_m(frames) for name, frames in dict(positive=positive, window=window).items() if frames is not None}
+    return EncodedBatch(f_o(obs), **others, **actions)
 
 
 def train(objective, make_frames, in_dim=6, n_updates=400):
@@ -32,7 +41,7 @@ def train(objective, make_frames, in_dim=6, n_updates=400):
     parameters = [p for p in [*encoder.parameters(), *objective.parameters()] if p.requires_grad]
     optimizer = th.optim.Adam(parameters, lr=3e-3)
     for _ in range(n_updates):
-        loss, metrics = objective.loss(Views(encoder, momentum, *make_frames()))
+        loss, metrics = objective.loss(encode(encoder, momentum, **make_frames()))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -49,7 +58,7 @@ def test_curl_recognises_frames_by_what_augmentation_leaves():
         # Three numbers say which frame it is, three are noise that each augmentation draws anew
         content = th.randn(32, 3)
         obs, positive = (th.cat([content, 3 * th.randn(32, 3)], dim=1) for _ in range(2))
-        return {"obs": obs, "positive": positive}, {}
+        return {"obs": obs, "positive": positive}
 
     encoder, metrics = train(Contrastive(8, 1), frames, n_updates=600)
     # Chance is an accuracy of 1/32
@@ -60,7 +69,7 @@ def test_curl_recognises_frames_by_what_augmentation_leaves():
 
 def test_curl_is_at_chance_where_the_positive_is_another_frame():
     th.manual_seed(0)
-    _, metrics = train(Contrastive(8, 1), lambda: ({"obs": th.randn(32, 6), "positive": th.randn(32, 6)}, {}), n_updates=100)
+    _, metrics = train(Contrastive(8, 1), lambda: {"obs": th.randn(32, 6), "positive": th.randn(32, 6)}, n_updates=100)
     assert metrics["loss"] > 0.9 * math.log(32)
 
 
@@ -68,15 +77,14 @@ def make_rollouts(actions_shown):
     """A point moves as the actions say; the objective may be shown other actions."""
     start, actions = th.randn(64, 2), th.randn(64, 3, 2)
     window = start[:, None] + actions.cumsum(dim=1)
-    data = {"window_actions": actions_shown(actions), "window_mask": th.ones(64, 3)}
-    return {"obs": start, "window": window.flatten(0, 1)}, data
+    return {"obs": start, "window": window, "window_actions": actions_shown(actions), "window_mask": th.ones(64, 3)}
 
 
 def test_spr_predicts_what_the_actions_do():
     losses = {}
     for name, shown in (("true", lambda actions: actions), ("other", th.randn_like)):
         th.manual_seed(0)
-        objective = SelfPredictive(8, 2, horizon=3, model_dim=64, projection_dim=32)
+        objective = SelfPredictive(8, 2, horizon=3)
         _, metrics = train(objective, lambda shown=shown: make_rollouts(shown), in_dim=2)
         losses[name] = metrics["loss"].item()
     assert losses["true"] < 0.5 * losses["other"]
@@ -84,27 +92,26 @@ def test_spr_predicts_what_the_actions_do():
 
 def test_spr_ignores_what_is_after_the_episode():
     th.manual_seed(0)
-    objective = SelfPredictive(8, 2, horizon=3, model_dim=16)
+    objective = SelfPredictive(8, 2, horizon=3)
     encoder = LinearEncoder(2, 8)
-    frames, data = make_rollouts(lambda actions: actions)
-    data["window_mask"][:, 1:] = 0
-    loss, _ = objective.loss(Views(encoder, encoder, frames, data))
-    changed = dict(frames, window=frames["window"].clone())
-    changed["window"].unflatten(0, (64, 3))[:, 1:] += 5
-    data["window_actions"][:, 1:] += 5
-    th.testing.assert_close(objective.loss(Views(encoder, encoder, changed, data))[0], loss)
+    rollouts = make_rollouts(lambda actions: actions)
+    rollouts["window_mask"][:, 1:] = 0
+    loss, _ = objective.loss(encode(encoder, encoder, **rollouts))
+    rollouts["window"][:, 1:] += 5
+    rollouts["window_actions"][:, 1:] += 5
+    th.testing.assert_close(objective.loss(encode(encoder, encoder, **rollouts))[0], loss)
 
 
 def test_spr_loss_is_the_sum_over_steps_of_2_minus_2_cosines():
     th.manual_seed(0)
-    objective = SelfPredictive(8, 2, horizon=3, model_dim=16)
+    objective = SelfPredictive(8, 2, horizon=3)
     encoder = LinearEncoder(2, 8)
-    frames, data = make_rollouts(lambda actions: actions)
-    loss, metrics = objective.loss(Views(encoder, encoder, frames, data))
-    latent, total = encoder.projection(encoder.trunk(frames["obs"])), 0.0
-    targets = objective.momentum_projector(encoder.projection(encoder.trunk(frames["window"]))).unflatten(0, (64, 3))
+    rollouts = make_rollouts(lambda actions: actions)
+    loss, metrics = objective.loss(encode(encoder, encoder, **rollouts))
+    latent, total = encoder(rollouts["obs"]), 0.0
+    targets = objective.momentum_projector(encoder(rollouts["window"]))
     for k in range(3):
-        latent = objective.model(th.cat([latent, data["window_actions"][:, k]], dim=1))
+        latent = objective.model(th.cat([latent, rollouts["window_actions"][:, k]], dim=1))
         prediction = objective.predictor(objective.projector(latent))
         prediction, target = (vector / vector.norm(dim=1, keepdim=True) for vector in (prediction, targets[:, k]))
         total = total + (prediction - target).square().sum(dim=1).mean()
@@ -112,12 +119,12 @@ def test_spr_loss_is_the_sum_over_steps_of_2_minus_2_cosines():
     assert metrics["loss"].item() == pytest.approx(total.item() / 3, rel=1e-5)
 
 
-@pytest.mark.parametrize("make", [lambda: Contrastive(8, 2), lambda: SelfPredictive(8, 2, horizon=3, model_dim=16)])
+@pytest.mark.parametrize("make", [lambda: Contrastive(8, 2), lambda: SelfPredictive(8, 2, horizon=3)])
 def test_gradients_reach_online_encoder_and_objective_and_nothing_else(make):
     th.manual_seed(0)
     objective, encoder, momentum = make(), LinearEncoder(2, 8), LinearEncoder(2, 8).requires_grad_(False)
-    frames, data = make_rollouts(lambda actions: actions)
-    objective.loss(Views(encoder, momentum, dict(frames, positive=frames["obs"] + 0.1), data))[0].backward()
+    rollouts = make_rollouts(lambda actions: actions)
+    objective.loss(encode(encoder, momentum, positive=rollouts["obs"] + 0.1, **rollouts))[0].backward()
     trained = [*encoder.parameters(), *(p for p in objective.parameters() if p.requires_grad)]
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in trained)
     assert all(p.grad is None for p in momentum.parameters())

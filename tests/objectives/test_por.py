@@ -1,34 +1,41 @@
 """The partial-order objective against the paper: equations (3) and (4), labels, gradients, the encoder leak."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch as th
 from torch import nn
 
-from sb3_por.objectives import PartialOrder
-from sb3_por.visual.views import Views
+from sb3_por.objectives import EncodedBatch, PartialOrder
 
 FEATURES_DIM = 4
 
 
-class TinyCritic(nn.Module):
-    """An owner of an encoder, as far as ``Views`` is concerned."""
+class TinyEncoder(nn.Sequential):
+    """An encoder of frames that are vectors of three numbers."""
 
     def __init__(self):
-        super().__init__()
-        self.trunk = nn.Linear(3, 6)
-        self.projection = nn.Linear(6, FEATURES_DIM)
+        super().__init__(nn.Linear(3, 6), nn.Linear(6, FEATURES_DIM))
 
 
-def make_views(critic, critic_target, obs, future):
-    return Views(critic, critic_target, {"obs": obs, "next": future, "future": future})
+def paired(first, second):
+    """
+    A batch for each pairing whose pairs are ``(first, second)``: where the encoders are swapped, the first frame is the past
+    and the second one the present.
+    """
+    half = len(first) // 2
+    present, has_past = th.cat([second[:half], first[half:]]), th.ones(half, 1, dtype=th.bool)
+    return dict(
+        paper=EncodedBatch(first, future=second),
+        swap=EncodedBatch(present, future=second, past=first[:half], has_past=has_past),
+    )
 
 
 @pytest.fixture
-def views():
+def frames():
     th.manual_seed(0)
-    return make_views(TinyCritic(), TinyCritic().requires_grad_(False), th.randn(8, 3), th.randn(8, 3))
+    return SimpleNamespace(past=th.randn(4, 3), present=th.randn(8, 3), future=th.randn(8, 3))
 
 
 class FixedLogits(nn.Module):
@@ -38,25 +45,16 @@ class FixedLogits(nn.Module):
         return th.where(first[:, 0] > second[:, 0], 2.0, -1.0)
 
 
-class Identity(nn.Module):
-    """Encoder and feature extractor that keep the number they see."""
-
-    trunk = projection = staticmethod(lambda frame: frame)
-
-    def forward(self, features):
-        return features
-
-
-def hand_views(earlier, later):
-    return make_views(Identity(), Identity(), th.tensor(earlier)[:, None], th.tensor(later)[:, None])
+def column(numbers):
+    return th.tensor(numbers)[:, None]
 
 
 @pytest.mark.parametrize("pairing", ["paper", "swap"])
 def test_loss_is_equation_4_on_hand_computed_values(pairing):
     objective = PartialOrder(FEATURES_DIM, 1, pairing=pairing)
-    objective.g, objective.c = Identity(), FixedLogits()
+    objective.g, objective.c = nn.Identity(), FixedLogits()
     # Pair 0 is in order: c(x_t, x_t+k) = sigmoid(-1), c(x_t+k, x_t) = sigmoid(2); pair 1 is the other way round
-    loss, metrics = objective.loss(hand_views([0.0, 5.0], [1.0, 3.0]))
+    loss, metrics = objective.loss(paired(column([0.0, 5.0]), column([1.0, 3.0]))[pairing])
     c_low, c_high = 1 / (1 + math.exp(1)), 1 / (1 + math.exp(-2))
     pair_0 = -math.log(1 - c_low) - math.log(c_high)
     pair_1 = -math.log(1 - c_high) - math.log(c_low)
@@ -67,72 +65,56 @@ def test_loss_is_equation_4_on_hand_computed_values(pairing):
 
 def test_label_0_is_earlier_first():
     objective = PartialOrder(FEATURES_DIM, 1)
-    objective.g, objective.c = Identity(), FixedLogits()
-    assert objective.loss(hand_views([0.0, 1.0], [2.0, 3.0]))[1]["accuracy"].item() == 1.0
-    assert objective.loss(hand_views([2.0, 3.0], [0.0, 1.0]))[1]["accuracy"].item() == 0.0
+    objective.g, objective.c = nn.Identity(), FixedLogits()
+    assert objective.loss(paired(column([0.0, 1.0]), column([2.0, 3.0]))["swap"])[1]["accuracy"].item() == 1.0
+    assert objective.loss(paired(column([2.0, 3.0]), column([0.0, 1.0]))["swap"])[1]["accuracy"].item() == 0.0
 
 
 def test_ties_count_half():
     objective = PartialOrder(FEATURES_DIM, 1, order_head="difference")
-    views = make_views(Identity(), Identity(), th.ones(4, FEATURES_DIM), th.ones(4, FEATURES_DIM))
-    loss, metrics = objective.loss(views)
+    loss, metrics = objective.loss(paired(th.ones(4, FEATURES_DIM), th.ones(4, FEATURES_DIM))["swap"])
     assert loss.item() == pytest.approx(2 * math.log(2))
     assert metrics["accuracy"].item() == 0.5
 
 
 @pytest.mark.parametrize("pairing", ["paper", "swap"])
 @pytest.mark.parametrize("order_head", ["mlp", "difference", "coordinatewise"])
-def test_gradients_reach_online_encoder_g_and_c_and_nothing_else(views, pairing, order_head):
-    objective = PartialOrder(FEATURES_DIM, 1, pairing=pairing, order_head=order_head)
-    loss, _ = objective.loss(views)
-    loss.backward()
+def test_gradients_reach_online_encoder_g_and_c(frames, pairing, order_head):
+    objective, f_o, f_m = PartialOrder(FEATURES_DIM, 1, pairing=pairing, order_head=order_head), TinyEncoder(), TinyEncoder()
+    has_past = column([True, True, False, True])
+    with th.no_grad():
+        future, past = f_m(frames.future), f_m(frames.past)
+    objective.loss(EncodedBatch(f_o(frames.present), future=future, past=past, has_past=has_past))[0].backward()
     # A constant cancels in a difference
     cancels = {"difference": "c.net.2.bias", "coordinatewise": "g.2.bias"}.get(order_head)
-    for name, parameter in [*objective.named_parameters(), *views.critic.named_parameters()]:
+    for name, parameter in [*objective.named_parameters(), *f_o.named_parameters()]:
         if name != cancels:
             assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
-    assert all(parameter.grad is None for parameter in views.critic_target.parameters())
 
 
-def test_paper_pairing_encodes_the_earlier_frame_online_and_the_later_with_momentum(views):
-    s_t, s_tk = PartialOrder(FEATURES_DIM, 1, pairing="paper").pairs(views)
-    assert th.equal(s_t, views.critic.projection(views.critic.trunk(views.frames["obs"])))
-    assert th.equal(s_tk, views.critic_target.projection(views.critic_target.trunk(views.frames["future"])))
+def test_paper_pairing_has_the_present_first_and_the_future_second(frames):
+    s_t, s_tk = PartialOrder(FEATURES_DIM, 1, pairing="paper").pairs(EncodedBatch(frames.present, future=frames.future))
+    assert th.equal(s_t, frames.present) and th.equal(s_tk, frames.future)
 
 
-def test_swap_pairing_swaps_the_encoders_and_keeps_the_times_in_half_of_the_batch(views):
-    s_t, s_tk = PartialOrder(FEATURES_DIM, 1, pairing="swap").pairs(views)
-    online = {name: views.critic.projection(views.critic.trunk(views.frames[name])) for name in ("obs", "future")}
-    momentum = {
-        name: views.critic_target.projection(views.critic_target.trunk(views.frames[name])) for name in ("obs", "future")
-    }
-    th.testing.assert_close(s_t, th.cat([momentum["obs"][:4], online["obs"][4:]]))
-    th.testing.assert_close(s_tk, th.cat([online["future"][:4], momentum["future"][4:]]))
-
-
-def test_swap_pairing_takes_earlier_frames_in_half_of_the_batch_where_there_are_some(views):
-    views.frames["past"] = th.randn(4, 3)
-    views.data["past_gaps"] = th.tensor([1, 1, 0, 1])
-    s_t, s_tk = PartialOrder(FEATURES_DIM, 1, pairing="swap").pairs(views)
-    online = views.critic.projection(views.critic.trunk(views.frames["obs"]))
-    future, past = (
-        views.critic_target.projection(views.critic_target.trunk(views.frames[name])) for name in ("future", "past")
-    )
-    # Pair 2 is the first of its episode
-    th.testing.assert_close(s_t, th.cat([past[:2], online[2:3], past[3:], online[4:]]))
-    th.testing.assert_close(s_tk, th.cat([online[:2], future[2:3], online[3:4], future[4:]]))
+def test_swap_pairing_has_the_present_second_in_half_of_the_batch_but_not_at_the_start_of_an_episode(frames):
+    has_past = column([True, True, False, True])
+    batch = EncodedBatch(frames.present, future=frames.future, past=frames.past, has_past=has_past)
+    s_t, s_tk = PartialOrder(FEATURES_DIM, 1, pairing="swap").pairs(batch)
+    past, present, future = frames.past, frames.present, frames.future
+    assert th.equal(s_t, th.cat([past[:2], present[2:3], past[3:], present[4:]]))
+    assert th.equal(s_tk, th.cat([present[:2], future[2:3], present[3:4], future[4:]]))
 
 
 @pytest.mark.parametrize("order_head", ["mlp", "difference", "coordinatewise"])
 def test_learns_an_order_and_a_potential_that_follows_it(order_head):
     th.manual_seed(0)
-    objective = PartialOrder(FEATURES_DIM, 1, order_head=order_head, hidden_dim=32)
+    objective = PartialOrder(FEATURES_DIM, 1, order_head=order_head, order_hidden_dim=32)
     optimizer = th.optim.Adam(objective.parameters(), lr=3e-3)
     for _ in range(300):
         features = th.randn(64, FEATURES_DIM)
         # Time is one direction in the features
-        views = make_views(Identity(), Identity(), features, features + th.tensor([0.0, 0.5, 0.0, 0.0]))
-        loss, metrics = objective.loss(views)
+        loss, metrics = objective.loss(paired(features, features + th.tensor([0.0, 0.5, 0.0, 0.0]))["swap"])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -147,22 +129,26 @@ def test_learns_an_order_and_a_potential_that_follows_it(order_head):
 def train_on_frames_without_time(pairing):
     """POR with an encoder and its moving average on i.i.d. frames: there is nothing to learn but the encoder."""
     th.manual_seed(0)
-    critic, critic_target = TinyCritic(), TinyCritic().requires_grad_(False)
-    critic_target.load_state_dict(critic.state_dict())
-    objective = PartialOrder(FEATURES_DIM, 1, pairing=pairing, hidden_dim=32)
-    optimizer = th.optim.Adam([*critic.parameters(), *objective.parameters()], lr=1e-3)
+    f_o, f_m = TinyEncoder(), TinyEncoder().requires_grad_(False)
+    f_m.load_state_dict(f_o.state_dict())
+    objective = PartialOrder(FEATURES_DIM, 1, pairing=pairing, order_hidden_dim=32)
+    optimizer = th.optim.Adam([*f_o.parameters(), *objective.parameters()], lr=1e-3)
+
+    def encode(present, future, past):
+        return EncodedBatch(f_o(present), future=f_m(future), past=f_m(past), has_past=th.ones(len(past), 1, dtype=th.bool))
+
     losses = []
     for _ in range(1000):
-        loss, metrics = objective.loss(make_views(critic, critic_target, th.randn(64, 3), th.randn(64, 3)))
+        loss, metrics = objective.loss(encode(th.randn(64, 3), th.randn(64, 3), th.randn(32, 3)))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         losses.append(metrics["loss"].item())
-        for online, momentum in zip(critic.parameters(), critic_target.parameters(), strict=True):
+        for online, momentum in zip(f_o.parameters(), f_m.parameters(), strict=True):
             momentum.lerp_(online.detach(), 0.05)
     frames = th.randn(4096, 3)
     with th.no_grad():
-        control = objective.control(make_views(critic, critic_target, frames, frames.clone()))
+        control = objective.control(encode(frames, frames, frames[:2048]))
     return sum(losses[-100:]) / 100, control
 
 

@@ -49,13 +49,12 @@ def test_unshared_actor_trains_a_trunk_of_its_own():
 
 def test_critic_loss_trains_the_encoder_and_actor_loss_leaves_no_gradient_there():
     model = make_model()
-    views = model._preparation.views(model._sample(8))
-    critic_loss = model._critic_loss(views.online("obs"), views.data["actions"], th.zeros(8, 1))
-    critic_loss.backward()
+    losses = model.losses(model.sample(8))
+    losses.critic.backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.critic.encoder_parameters())
     model.critic.optimizer.zero_grad()
     before = snapshot(model.actor.own_parameters())
-    model._update_actor(views, th.ones(1))
+    model._step_actor(losses)
     assert all(p.grad is None for p in model.critic.parameters())
     assert not same(before, model.actor.own_parameters())
 
@@ -151,7 +150,7 @@ def test_reward_scale_scales_the_target():
     np.random.seed(0)
     model.train(1, 8)
     np.random.seed(0)
-    th.testing.assert_close(targets[0], 3.0 * model._sample(8).rewards)
+    th.testing.assert_close(targets[0], 3.0 * model.sample(8).rewards)
 
 
 @pytest.mark.parametrize(("cls", "n_steps"), [(VisualSAC, 1), (VisualSAC, 3), (TQCPOR, 1)])
@@ -163,16 +162,16 @@ def test_values_may_start_at_what_the_mean_reward_is_worth(cls, n_steps):
         model.train(1, 8)
         model.train(1, 8)
         assert model._start_values.call_count == int(start)
-        data = model._sample(30)
+        data = model.sample(30)
         with th.no_grad():
             return [th.stack(list(net(data.observations, data.actions))).mean() for net in (model.critic, model.critic_target)]
 
-    # -2 a step, times 3, for ever: the sum of 0.9^t is 10
+    # The sum of 0.9^t times -2 times 3 over all steps: 10 times -6
     assert q_values(True) == pytest.approx([-60.0] * 2, abs=2.0)
     assert q_values(False) == pytest.approx([0.0] * 2, abs=2.0)
 
 
-def test_a_reward_for_ever_needs_a_discount():
+def test_starting_at_the_mean_reward_needs_a_discount():
     with pytest.raises(ValueError, match="gamma < 1"):
         make_model(gamma=1.0, start_at_mean_reward=True)
 
@@ -182,7 +181,7 @@ def share_of_switching_units(**kwargs):
     env = TransformReward(DotEnv(), lambda reward: 20 * (reward - 10.0))
     model = make_model(env=env, n_collected=100, gamma=0.95, learning_rate=1e-3, **kwargs)
     model.train(200, 8)
-    data = model._sample(200)
+    data = model.sample(200)
     with th.no_grad():
         hidden = th.cat([model.critic.encode(data.observations), data.actions], dim=1)
         hidden = model.critic.q_networks[0][:-1](hidden)
@@ -216,17 +215,27 @@ def test_layer_norm_of_the_critics_is_trained_and_follows(cls):
 def test_k_and_m_augmentations_are_averaged():
     model = make_model(n_augmentations=2, n_target_augmentations=2, augmentation_pad=0)
     assert count_encodings(model) == dict(online=32, momentum=16)
-    views = model._preparation.views(model._sample(4))
-    assert set(views.frames) == {"obs", "obs_1", "next", "next_1"}
+    frames = model._augmentation.frames(model.sample(4), None, 3, 2)
+    assert (len(frames.present), len(frames.next)) == (12, 8)
+
+
+def test_augmentations_average_losses_and_targets():
+    """With K = M = 2 copies of the same frames the loss is that of one."""
+    losses = []
+    for n in (1, 2):
+        model = make_model(n_augmentations=n, n_target_augmentations=n, augmentation_pad=0, gamma=0.0)
+        np.random.seed(0)
+        losses.append(model.losses(model.sample(8)).critic.item())
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
 
 
 def test_frames_are_augmented_independently():
     model = make_model(SACPOR, augmentation_pad=4)
-    frames = model._preparation.views(model._sample(64)).frames
-    assert frames["future"] is frames["next"]
     th.manual_seed(0)
-    replay_data = model._sample(64)
-    first, second = model._preparation.prepare(replay_data.observations), model._preparation.prepare(replay_data.observations)
+    batch = model.sample(64)
+    first, second = model._augmentation(batch.observations), model._augmentation(batch.observations)
+    twice = model._augmentation(batch.observations, 2)
+    assert len(twice) == 128 and not th.equal(twice[:64], twice[64:])
     assert not th.equal(first, second)
     assert first.dtype == th.float32 and first.max() <= 1.0
 

@@ -94,7 +94,6 @@ def _last_lines(log: Path) -> list[str]:
     return log.read_text(errors="replace").splitlines()[-LOG_LINES:] if log.is_file() else []
 
 
-
 def is_running(run: Path) -> bool:
     """Whether a process is at work in a run's folder, as far as can be told: on this machine."""
     lock = run / ".lock"
@@ -124,7 +123,6 @@ def progress(run: Path) -> tuple[int, float | None]:
         latest = float(np.mean(arrays.get("normalized_performance", np.full((1, 1), np.nan))[-1]))
         score = None if np.isnan(latest) else latest
     return steps, score
-
 
 
 def run_identity(run: Path) -> dict[str, Any]:

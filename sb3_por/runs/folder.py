@@ -1,19 +1,12 @@
 """A run's folder, in the RL Zoo's layout: where its files are and what its settings say."""
 
-import os
-import platform
-import re
-import subprocess
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
-import torch as th
 import yaml
-from filelock import FileLock, Timeout
 
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.files import atomic_write
@@ -67,10 +60,6 @@ def is_finished(run: Path, env_id: str) -> bool:
     return (run / f"{env_id}.zip").exists() and not (run / CHECKPOINTS).exists()
 
 
-
-
-
-
 def read_evaluations(run: Path) -> dict[str, np.ndarray]:
     """
     :param run: a run folder
@@ -101,7 +90,3 @@ def find_runs(paths: Iterable[str | Path]) -> list[Path]:
             raise UserError(f"no run under {path}: none of its folders has an {EVALUATIONS}")
         runs |= found
     return sorted(runs)
-
-
-
-

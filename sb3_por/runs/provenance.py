@@ -4,19 +4,10 @@ import os
 import platform
 import re
 import subprocess
-import zipfile
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import psutil
 import torch as th
-import yaml
-from filelock import FileLock, Timeout
-
-from sb3_por.common.errors import UserError, one_line
-from sb3_por.common.files import atomic_write
 
 
 def current_commit() -> str:

@@ -1,21 +1,14 @@
 """One update of the visual algorithms: critic and objective train the encoder, then the actor follows (Algorithm 1)."""
 
-import warnings
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
-from stable_baselines3.common.buffers import NStepReplayBuffer
-from stable_baselines3.common.type_aliases import MaybeCallback, PyTorchObs
+from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import polyak_update, update_learning_rate
 
-from sb3_por.acceleration.overlap import OverlappedTraining
-from sb3_por.acceleration.precision import check_precision
-from sb3_por.acceleration.updates import AcceleratedUpdates
-from sb3_por.common.random_state import SavedRandomState
-from sb3_por.common.running_means import RunningMeans
-from sb3_por.objectives.base import Objective
-from sb3_por.visual.batch import Augmentation, Frames, encode, repeat, take
+from sb3_por.visual.algorithm import VisualAlgorithm
+from sb3_por.visual.batch import Frames, encode, repeat, take
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 
 
@@ -37,7 +30,7 @@ class Losses(NamedTuple):
     trunk_t: th.Tensor
 
 
-class VisualActorCritic(OverlappedTraining, SavedRandomState, ABC):
+class VisualActorCritic(VisualAlgorithm, ABC):
     """
     A mixin for SB3's off-policy actor-critics (SAC, TQC). One update: encode each frame once per encoder; critic loss +
     lambda * objective loss, one backward pass, one optimizer step over encoder, critic and objective (two steps, for
@@ -45,41 +38,6 @@ class VisualActorCritic(OverlappedTraining, SavedRandomState, ABC):
 
     A subclass says how its critic measures values: ``_next_values``, ``_critic_loss`` and ``_actor_values``.
     """
-
-    #: The auxiliary objective; None for none
-    objective_class: ClassVar[type[Objective] | None] = None
-    #: Default of ``encoder_tau``, in units of ``tau``
-    encoder_tau_ratio: ClassVar[float] = 1.0
-
-    #: Learning rate of an objective that has an optimizer of its own, in units of ``learning_rate``
-    aux_lr_ratio: float = 1.0
-
-    # Set by the subclass's constructor, which documents them
-    encoder_tau: float | None
-    actor_update_interval: int
-    ent_coef_lr_ratio: float
-    reward_scale: float
-    start_at_mean_reward: bool
-    augmentation_pad: int
-    n_augmentations: int
-    n_target_augmentations: int
-    diagnostics_interval: int
-    precision: str
-    compile_mode: str | None
-
-    # What SAC and TQC have in common
-    policy: Any
-    actor: Any
-    replay_buffer: Any
-    critic: Any
-    critic_target: Any
-    ent_coef_optimizer: Any
-    log_ent_coef: Any
-    ent_coef_tensor: th.Tensor
-    target_entropy: Any
-    target_update_interval: int
-    batch_norm_stats: list[th.Tensor]
-    batch_norm_stats_target: list[th.Tensor]
 
     @property
     def objective_coef(self) -> float:
@@ -353,75 +311,3 @@ class VisualActorCritic(OverlappedTraining, SavedRandomState, ABC):
     def dump_logs(self) -> None:
         self._record_metrics()
         super().dump_logs()
-
-    # -- set-up, saving -------------------------------------------------------------------------------------------
-
-    def _setup_model(self) -> None:
-        check_precision(self.precision)
-        if self.start_at_mean_reward and self.gamma >= 1.0:
-            raise ValueError("start_at_mean_reward needs gamma < 1: without a discount, the sum of all rewards is infinite")
-        if self.objective_class is not None:
-            # The objective's arguments are attributes of the same names, so that load(path, k=3) changes them as in SB3
-            arguments = {name: getattr(self, name) for name in self.objective_class.arguments()}
-            self.policy_kwargs = dict(self.policy_kwargs, objective_class=self.objective_class, objective_kwargs=arguments)
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = SequenceReplayBuffer
-        own_buffer = issubclass(self.replay_buffer_class, SequenceReplayBuffer)
-        if own_buffer:
-            self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs, n_steps=self.n_steps, gamma=self.gamma)
-        with warnings.catch_warnings():
-            if own_buffer:
-                # SB3 knows its own buffers only
-                warnings.filterwarnings("ignore", message="`n_steps=")
-            super()._setup_model()
-        if own_buffer:
-            # If set, SB3 would end the episode that a second learn() cuts off
-            self.optimize_memory_usage = False
-        self._check_buffer()
-        self._acceleration = AcceleratedUpdates(self.policy, self.precision, self.compile_mode)
-        self._augmentation = Augmentation(self.policy, self.augmentation_pad)
-        self._metrics = RunningMeans()
-
-    def _check_buffer(self) -> None:
-        """
-        :raises ValueError: If the replay buffer cannot sample the frames that the objective uses
-        """
-        objective, buffer = self.policy.objective, self.replay_buffer
-        if objective is None or isinstance(buffer, SequenceReplayBuffer):
-            return
-        next_is_future = not (isinstance(buffer, NStepReplayBuffer) and buffer.n_steps > 1)
-        has_future = objective.future is None or (objective.future == (1, 1) and next_is_future)
-        if objective.window > 0 or not has_future:
-            raise ValueError(
-                f"{type(buffer).__name__} cannot sample the later frames that {type(self).__name__} needs with these "
-                "settings: use the default replay_buffer_class, SequenceReplayBuffer."
-            )
-
-    def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Any:
-        """
-        :param total_timesteps: Number of environment steps
-        :param callback: Called at every step
-        :param log_interval: Log every ``log_interval`` episodes
-        :param tb_log_name: Name of the run in TensorBoard; the name of the class by default
-        :param reset_num_timesteps: Start counting from zero. False continues; a loaded model as if it had never stopped
-        :param progress_bar: Show a progress bar
-        :return: The model
-        """
-        name = type(self).__name__ if tb_log_name is None else tb_log_name
-        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, tensors = super()._get_torch_save_params()
-        own = [] if self.policy.objective_optimizer is None else ["policy.objective_optimizer"]
-        return [*state_dicts, *own], tensors
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_augmentation", "_acceleration"]

@@ -239,12 +239,26 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         return self._unwrap(views)
 
     def _wrap(self, obs: Any) -> dict[str, np.ndarray]:
-        """Give every observation the form of a Dict observation, with the type and shape of the store."""
+        """
+        Give every observation the form of a Dict observation, with the type and shape of the store.
+
+        :raises ValueError: If an observation has another shape, or a type that cannot be cast without loss of its kind
+        """
         parts = obs if self.is_dict else {"": obs}
-        return {
-            key: np.array(parts[key], dtype=self._spaces[key].dtype).reshape(self.n_envs, *shape)
-            for key, shape in self._shapes.items()
-        }
+        return {key: self._check(np.asarray(parts[key]), key) for key in self._shapes}
+
+    def _check(self, part: np.ndarray, key: str) -> np.ndarray:
+        space, shape = self._spaces[key], (self.n_envs, *self._shapes[key])
+        if not isinstance(space, spaces.Box) and part.size == np.prod(shape):
+            part = part.reshape(shape)  # Discrete: one number without an axis of its own, as in SB3
+        if part.shape != shape or not np.can_cast(part.dtype, space.dtype, "same_kind"):  # type: ignore[arg-type]
+            name = f"the observation {key!r}" if key else "an observation"
+            raise ValueError(
+                f"{name} of shape {part.shape} and type {part.dtype} does not fit into a replay buffer for "
+                f"{self.n_envs} environments with {space}: is there a wrapper that changes observations around VecNormalize, "
+                "or a buffer of other environments?"
+            )
+        return part.astype(space.dtype)
 
     def _unwrap(self, parts: dict[str, Any]) -> Any:
         return parts if self.is_dict else parts[""]

@@ -1,0 +1,193 @@
+"""Set-up, saving and loading of the visual algorithms."""
+
+import io
+import pathlib
+import warnings
+from typing import Any, ClassVar
+
+import torch as th
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_por.acceleration.overlap import OverlappedTraining
+from sb3_por.acceleration.precision import check_precision
+from sb3_por.acceleration.updates import AcceleratedUpdates
+from sb3_por.common.random_state import SavedRandomState
+from sb3_por.common.running_means import RunningMeans
+from sb3_por.objectives.base import Objective
+from sb3_por.visual.batch import Augmentation
+from sb3_por.visual.normalization import transpose_inside
+from sb3_por.visual.replay_buffer import SequenceReplayBuffer
+
+
+class VisualAlgorithm(OverlappedTraining, SavedRandomState):
+    """
+    A mixin for SB3's off-policy actor-critics (SAC, TQC): builds what an update needs, and refuses what does not fit. The
+    update itself is ``VisualActorCritic``'s.
+    """
+
+    #: The auxiliary objective; None for none
+    objective_class: ClassVar[type[Objective] | None] = None
+    #: Default of ``encoder_tau``, in units of ``tau``
+    encoder_tau_ratio: ClassVar[float] = 1.0
+
+    #: Learning rate of an objective that has an optimizer of its own, in units of ``learning_rate``
+    aux_lr_ratio: float = 1.0
+
+    # Set by the subclass's constructor, which documents them
+    encoder_tau: float | None
+    actor_update_interval: int
+    ent_coef_lr_ratio: float
+    reward_scale: float
+    start_at_mean_reward: bool
+    augmentation_pad: int
+    n_augmentations: int
+    n_target_augmentations: int
+    diagnostics_interval: int
+    precision: str
+    compile_mode: str | None
+
+    # What SAC and TQC have in common
+    policy: Any
+    actor: Any
+    replay_buffer: Any
+    critic: Any
+    critic_target: Any
+    ent_coef_optimizer: Any
+    log_ent_coef: Any
+    ent_coef_tensor: th.Tensor
+    target_entropy: Any
+    target_update_interval: int
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
+    batch_norm_stats: list[th.Tensor]
+    batch_norm_stats_target: list[th.Tensor]
+
+    def _setup_model(self) -> None:
+        check_precision(self.precision)
+        if self.start_at_mean_reward and self.gamma >= 1.0:
+            raise ValueError("start_at_mean_reward needs gamma < 1: without a discount, the sum of all rewards is infinite")
+        self._check_class()
+        # The objective's arguments are attributes of the same names, so that load(path, k=3) changes them, as in SB3
+        names = [] if self.objective_class is None else self.objective_class.arguments()
+        objective = {
+            "objective_class": self.objective_class,
+            "objective_kwargs": {name: getattr(self, name) for name in names},
+        }
+        self.policy_kwargs = {**self.policy_kwargs, **objective}
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = SequenceReplayBuffer
+        own_buffer = issubclass(self.replay_buffer_class, SequenceReplayBuffer)
+        if own_buffer:
+            self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs, n_steps=self.n_steps, gamma=self.gamma)
+        with warnings.catch_warnings():
+            if own_buffer:
+                # SB3 knows its own buffers only
+                warnings.filterwarnings("ignore", message="`n_steps=")
+            super()._setup_model()
+        if own_buffer:
+            # If set, SB3 would end the episode that a second learn() cuts off
+            self.optimize_memory_usage = False
+        self._check_buffer()
+        self._acceleration = AcceleratedUpdates(self.policy, self.precision, self.compile_mode)
+        self._augmentation = Augmentation(self.policy, self.augmentation_pad)
+        self._metrics = RunningMeans()
+
+    def _check_class(self) -> None:
+        """
+        :raises ValueError: If a loaded model was saved by a class with another critic or another objective
+        """
+        policy_class = self.policy_aliases["MlpPolicy"]
+        if not issubclass(self.policy_class, policy_class):
+            raise ValueError(f"{type(self).__name__} needs a {policy_class.__name__}, not a {self.policy_class.__name__}")
+        trained = self.policy_kwargs.get("objective_class", self.objective_class)
+        if trained is not self.objective_class:
+            names = [
+                "no objective" if one is None else f"the objective {one.__name__}" for one in (trained, self.objective_class)
+            ]
+            raise ValueError(
+                f"{type(self).__name__} has {names[1]}, and this model was trained with {names[0]}: load it with the class "
+                "that saved it. To start one method from the encoder of another, make a new model and call its load_encoder()."
+            )
+
+    def _check_buffer(self) -> None:
+        """
+        :raises ValueError: If the replay buffer cannot sample the frames that the objective uses
+        """
+        objective, buffer = self.policy.objective, self.replay_buffer
+        if objective is None or isinstance(buffer, SequenceReplayBuffer):
+            return
+        next_is_future = not (isinstance(buffer, NStepReplayBuffer) and buffer.n_steps > 1)
+        has_future = objective.future is None or (objective.future == (1, 1) and next_is_future)
+        if objective.window > 0 or not has_future:
+            raise ValueError(
+                f"{type(buffer).__name__} cannot sample the later frames that {type(self).__name__} needs with these "
+                "settings: use the default replay_buffer_class, SequenceReplayBuffer."
+            )
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Any:
+        """
+        :param total_timesteps: Number of environment steps
+        :param callback: Called at every step
+        :param log_interval: Log every ``log_interval`` episodes
+        :param tb_log_name: Name of the run in TensorBoard; the name of the class by default
+        :param reset_num_timesteps: Start counting from zero. False continues; a loaded model as if it had never stopped
+        :param progress_bar: Show a progress bar
+        :return: The model
+        """
+        name = type(self).__name__ if tb_log_name is None else tb_log_name
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+
+    @staticmethod
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return OffPolicyAlgorithm._wrap_env(transpose_inside(env), verbose, monitor_wrapper)
+
+    def load_encoder(self, other: "VisualAlgorithm") -> None:
+        """
+        Start from the encoder of another model, also of another method; everything else stays as it is.
+
+        :param other: Model with an encoder of the same shape
+        :raises ValueError: If the encoder has another shape
+        """
+        try:
+            for critic in (self.critic, self.critic_target):
+                critic.features_extractor.load_state_dict(other.critic.features_extractor.state_dict())
+                critic.projection.load_state_dict(other.critic.projection.state_dict())
+        except RuntimeError as error:
+            raise ValueError(f"the encoder of {type(other).__name__} has another shape: {error}") from error
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        :param path: File that ``save_replay_buffer()`` wrote
+        :param truncate_last_traj: See SB3
+        :raises ValueError: If the buffer is of another kind, or was filled with other environments or other returns
+        """
+        own = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded = self.replay_buffer
+        for name in ("n_envs", "observation_space", "action_space", "n_steps", "gamma"):
+            values = [getattr(buffer, name, None) for buffer in (loaded, own)]
+            if type(loaded) is not type(own) or values[0] != values[1]:
+                self.replay_buffer = own
+                differs = (
+                    ("kind", type(loaded).__name__, type(own).__name__) if type(loaded) is not type(own) else (name, *values)
+                )
+                raise ValueError("the {} of the replay buffer in the file is {}, and this model's is {}".format(*differs))
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        own = [] if self.policy.objective_optimizer is None else ["policy.objective_optimizer"]
+        return [*state_dicts, *own], tensors
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_metrics", "_augmentation", "_acceleration"]

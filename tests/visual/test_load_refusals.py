@@ -1,0 +1,62 @@
+"""What does not belong to a model is refused where it is loaded; an encoder can be taken from another method."""
+
+import re
+
+import pytest
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv
+from toy_envs import DotEnv
+
+from sb3_por import SACCURL, SACPOR, TQCPOR, SACDrQ, VisualSAC
+
+POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
+
+
+def make_model(cls, env=None, **kwargs):
+    arguments = dict(policy_kwargs=POLICY, buffer_size=200, learning_starts=10, batch_size=8, seed=0, device="cpu")
+    return cls("CnnPolicy", env or DotEnv(size=20), **{**arguments, **kwargs})
+
+
+@pytest.mark.parametrize("cls", [SACCURL, SACDrQ, VisualSAC, TQCPOR])
+def test_a_model_is_refused_by_the_class_of_another_method(cls, tmp_path):
+    make_model(SACPOR).save(tmp_path / "por.zip")
+    with pytest.raises(ValueError, match=f"{cls.__name__} (has|needs)"):
+        cls.load(tmp_path / "por.zip", device="cpu")
+    make_model(SACDrQ).save(tmp_path / "drq.zip")
+    with pytest.raises(ValueError, match="was trained with no objective"):
+        SACPOR.load(tmp_path / "drq.zip", device="cpu")
+
+
+def test_a_method_can_start_from_the_encoder_of_another():
+    por, drq = make_model(SACPOR, seed=1).learn(40), make_model(SACDrQ, seed=2)
+    heads = [parameter.clone() for parameter in drq.critic.head_parameters()]
+    drq.load_encoder(por)
+    for critic in (drq.critic, drq.critic_target):
+        assert all(map(th.equal, critic.encoder_parameters(), por.critic.encoder_parameters()))
+    assert all(map(th.equal, heads, drq.critic.head_parameters()))
+    drq.learn(40)
+    other = make_model(
+        VisualSAC, policy_kwargs=dict(net_arch=[8], features_extractor_kwargs=dict(n_filters=8, strides=(2, 2)))
+    )
+    with pytest.raises(ValueError, match="has another shape"):
+        other.load_encoder(por)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        (dict(n_steps=3), "n_steps of the replay buffer in the file is 1, and this model's is 3"),
+        (dict(gamma=0.5), "gamma of the replay buffer in the file is 0.99, and this model's is 0.5"),
+        (dict(replay_buffer_class=ReplayBuffer), "kind of the replay buffer in the file is SequenceReplayBuffer"),
+        (dict(env=DummyVecEnv([lambda: DotEnv(size=20)] * 2)), "n_envs of the replay buffer in the file is 1"),
+        (dict(env=DotEnv(size=24)), "observation_space of the replay buffer in the file is"),
+    ],
+)
+def test_a_buffer_of_another_model_is_refused(kwargs, message, tmp_path):
+    make_model(SACPOR, env=DotEnv(size=20)).learn(20).save_replay_buffer(tmp_path / "buffer.pkl")
+    model = make_model(SACPOR, **{"env": DotEnv(size=20), **kwargs})
+    own = model.replay_buffer
+    with pytest.raises(ValueError, match=re.escape(message)):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.replay_buffer is own

@@ -35,7 +35,7 @@ class Command:
 
 
 def _model_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
-    models = "a .zip, a run folder (its best_model.zip), random, nothing, or expert"
+    models = "a .zip, a run folder (its best model), random, nothing, or expert"
     parser.add_argument("--model", required=required, help=models)
     parser.add_argument("--env", required=required, help="environment id")
     parser.add_argument("--algo", help="algorithm that saved the model, if it cannot be told from the file")

@@ -20,7 +20,16 @@ from sb3_por import ALGORITHMS
 from sb3_por.common.errors import UserError, check_known, one_line
 from sb3_por.evaluation.episodes import whole_episodes
 from sb3_por.evaluation.evaluate import EnvWrapper
-from sb3_por.runs.folder import BEST_STATISTICS, read_settings, run_arguments, the_run
+from sb3_por.runs.folder import (
+    ARGUMENTS,
+    BEST_MODEL,
+    BEST_STATISTICS,
+    HYPERPARAMETERS,
+    STATISTICS,
+    read_settings,
+    run_arguments,
+    the_run,
+)
 
 #: name -> class of every algorithm whose models can be loaded; a DDPG model is a TD3 model with other settings
 LOADABLE: dict[str, type[BaseAlgorithm]] = {
@@ -74,7 +83,7 @@ def model_file(path: str | Path) -> Path:
     """
     path = Path(path)
     if path.is_dir():
-        path = the_run(path) / "best_model.zip"
+        path = the_run(path) / BEST_MODEL
     if not path.is_file():
         raise UserError(f"there is no model {path}; give a .zip that train.py or model.save() wrote")
     return path
@@ -86,7 +95,7 @@ def settings_of(path: str | Path, env_id: str) -> Path:
     :param env_id: the environment
     :return: where the settings of the model's run are, if it has any
     """
-    return model_file(path).parent / env_id / "config.yml"
+    return model_file(path).parent / env_id / HYPERPARAMETERS
 
 
 def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
@@ -104,7 +113,7 @@ def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
     settings = read_settings(settings_of(path, env_id))
     env_kwargs = settings.get("env_kwargs")
     of_best = folder / BEST_STATISTICS
-    statistics = of_best if file.name == "best_model.zip" and of_best.is_file() else folder / "vecnormalize.pkl"
+    statistics = of_best if file.name == BEST_MODEL and of_best.is_file() else folder / STATISTICS
     return {
         "env_kwargs": whole_episodes(env_kwargs) if isinstance(env_kwargs, dict) else {},
         "vec_normalize": str(statistics) if statistics.is_file() else None,
@@ -179,7 +188,7 @@ def _candidates(path: Path, data: dict[str, Any]) -> list[str]:
     Algorithms that may have saved a model, the likeliest first: those with its policy class; among them the one that
     its run's settings name; then those that have most of their constructor's arguments in the file.
     """
-    recorded = {read_settings(settings).get("algo") for settings in path.parent.glob("*/args.yml")}
+    recorded = {read_settings(settings).get("algo") for settings in path.parent.glob(f"*/{ARGUMENTS}")}
     module = data["policy_class"].get("__module__") if isinstance(data["policy_class"], dict) else None
 
     def unlikeliness(name: str) -> tuple[bool, int, int]:

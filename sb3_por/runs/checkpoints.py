@@ -17,8 +17,10 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_por.common.files import atomic_write
 from sb3_por.common.random_state import get_rng_state
-from sb3_por.runs.folder import CHECKPOINTS
+from sb3_por.runs.folder import CHECKPOINTS, MONITORS, STATISTICS
 
+#: Model in the folder of a checkpoint
+MODEL = "model.zip"
 #: Bytes of a replay buffer that are stored together; only blocks that changed are written again.
 BLOCK_SIZE = 4 * 2**20
 
@@ -42,9 +44,9 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: float
         return final
     temporary = root / f".{uuid.uuid4().hex}"
     temporary.mkdir(parents=True)
-    model.save(temporary / "model.zip")
+    model.save(temporary / MODEL)
     (temporary / "rng.pickle").write_bytes(pickle.dumps(get_rng_state(model.action_space)))
-    monitors = {file.name: file.stat().st_size for file in run.glob("*.monitor.csv")}
+    monitors = {file.name: file.stat().st_size for file in run.glob(MONITORS)}
     (temporary / "monitors.json").write_text(json.dumps(monitors))
     (temporary / "seconds.json").write_text(json.dumps(seconds))
     used: set[str] = set()
@@ -54,7 +56,7 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: float
     statistics = model.get_vec_normalize_env()
     if statistics is not None:
         (temporary / env_id).mkdir()
-        statistics.save(str(temporary / env_id / "vecnormalize.pkl"))
+        statistics.save(str(temporary / env_id / STATISTICS))
     for file in temporary.rglob("*"):
         if file.is_file():
             with open(file, "rb") as opened:

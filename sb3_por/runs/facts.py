@@ -8,13 +8,23 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from sb3_por.runs.folder import EVALUATIONS, is_finished, read_evaluations, read_settings, run_arguments
+from sb3_por.runs.folder import (
+    ARGUMENTS,
+    EVALUATIONS,
+    HYPERPARAMETERS,
+    LOCK,
+    LOG,
+    MONITORS,
+    is_finished,
+    read_evaluations,
+    read_settings,
+    run_arguments,
+)
 
-#: Where a suite keeps what a run prints: beside the run's own folders.
-LOG = "log.txt"
+#: Lines of a log that are kept.
 LOG_LINES = 15
 #: Arguments of train.py that belong to a run's settings; the others say where files are and how the search is done.
-ARGUMENTS = ("algo", "eval_freq", "eval_episodes", "save_freq", "num_threads", "device", "vec_env", "env_kwargs", "conf_file")
+SETTINGS = ("algo", "eval_freq", "eval_episodes", "save_freq", "num_threads", "device", "vec_env", "env_kwargs", "conf_file")
 
 
 @dataclass(frozen=True)
@@ -57,7 +67,7 @@ def take_inventory(folders: Iterable[str | Path]) -> list[RunFacts]:
     """
     runs = set()
     for folder in map(Path, folders):
-        runs |= {file.parent for file in folder.rglob(EVALUATIONS)} | {file.parents[1] for file in folder.rglob("args.yml")}
+        runs |= {file.parent for file in folder.rglob(EVALUATIONS)} | {file.parents[1] for file in folder.rglob(ARGUMENTS)}
     return sorted(map(_facts, runs), key=lambda run: (run.env, run.algo, run.seed, run.folder))
 
 
@@ -67,13 +77,13 @@ def orphaned_logs(folders: Iterable[str | Path]) -> dict[Path, list[str]]:
     :return: log -> its last lines, of what failed before it had a run's folder
     """
     logs = sorted(log for folder in folders for log in Path(folder).rglob(LOG))
-    return {log: _last_lines(log) for log in logs if not any(log.parent.rglob("args.yml"))}
+    return {log: _last_lines(log) for log in logs if not any(log.parent.rglob(ARGUMENTS))}
 
 
 def _facts(run: Path) -> RunFacts:
     arguments = run_arguments(run)
     identity = run_identity(run)
-    config = read_settings(run / identity["env"] / "config.yml")
+    config = read_settings(run / identity["env"] / HYPERPARAMETERS)
     # -1 is the zoo's "as many as the settings say".
     planned = next((n for n in (arguments.get("n_timesteps"), config.get("n_timesteps")) if n and n > 0), None)
     finished = is_finished(run, identity["env"])
@@ -85,7 +95,7 @@ def _facts(run: Path) -> RunFacts:
         planned=None if planned is None else int(planned),
         commit=arguments.get("commit", ""),
         machine=arguments.get("machine", ""),
-        settings={**config, **{name: arguments[name] for name in ARGUMENTS if arguments.get(name) not in (None, -1)}},
+        settings={**config, **{name: arguments[name] for name in SETTINGS if arguments.get(name) not in (None, -1)}},
         log=[] if finished else _last_lines(run.parents[1] / LOG),
     )
 
@@ -96,7 +106,7 @@ def _last_lines(log: Path) -> list[str]:
 
 def is_running(run: Path) -> bool:
     """Whether a process is at work in a run's folder, as far as can be told: on this machine."""
-    lock = run / ".lock"
+    lock = run / LOCK
     if not lock.is_file():
         return False
     try:
@@ -113,7 +123,7 @@ def progress(run: Path) -> tuple[int, float | None]:
     :return: steps that the run has done, to the last episode's end, and its latest mean normalized performance
     """
     steps = 0
-    for monitor in run.glob("*.monitor.csv"):
+    for monitor in run.glob(MONITORS):
         rows = (line.split(",") for line in monitor.read_text().splitlines()[2:])
         steps += sum(int(row[1]) for row in rows if len(row) > 2)
     score = None

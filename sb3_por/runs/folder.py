@@ -11,11 +11,42 @@ import yaml
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.files import atomic_write
 
+#: Evaluations of a run, in SB3's format with further arrays
 EVALUATIONS = "evaluations.npz"
-#: ``VecNormalize`` statistics of the best model, beside the last one's, which the zoo calls ``vecnormalize.pkl``.
-BEST_STATISTICS = "best_vecnormalize.pkl"
-#: Folder of what a killed run goes on from; a finished run has none.
+#: Model with the best evaluation; the last one is ``last_model(env_id)``
+BEST_MODEL = "best_model.zip"
+#: Folder of the checkpoint that an interrupted run resumes from; a finished run has none
 CHECKPOINTS = "checkpoint"
+#: Lock of the process that writes to a run's folder, or of the suite that writes to its folder
+LOCK = ".lock"
+#: Episodes of a training environment, written by SB3's ``Monitor``
+MONITORS = "*.monitor.csv"
+#: Folder of TensorBoard's files, unless the user names another one
+TENSORBOARD = "tb"
+#: The replay buffer at the end of a run, if it is to be saved
+REPLAY_BUFFER = "replay_buffer.pkl"
+#: Output of a suite's run; in the suite's folder of the run, two levels above the run's folder
+LOG = "log.txt"
+
+# In the folder of settings, <run>/<env>/:
+#: Arguments of the command line
+ARGUMENTS = "args.yml"
+#: Hyperparameters
+HYPERPARAMETERS = "config.yml"
+#: The command as it was typed
+COMMAND = "command.txt"
+#: ``VecNormalize`` statistics of the last model, and those of the best one
+STATISTICS, BEST_STATISTICS = "vecnormalize.pkl", "best_vecnormalize.pkl"
+
+
+def last_model(env_id: str) -> str:
+    """Name of the model at the end of a run. The file marks a finished run."""
+    return f"{env_id}.zip"
+
+
+def intermediate_model(n_steps: int) -> str:
+    """Name of the model after a number of steps."""
+    return f"rl_model_{n_steps}_steps.zip"
 
 
 class _PlainDumper(yaml.SafeDumper):
@@ -27,15 +58,15 @@ _PlainDumper.add_multi_representer(dict, lambda dumper, value: dumper.represent_
 
 
 def write_settings(path: Path, settings: dict[str, Any]) -> None:
-    """Write ``args.yml`` or ``config.yml`` of a run as plain YAML."""
+    """Write arguments or hyperparameters of a run as plain YAML."""
     with atomic_write(path) as temporary:
         temporary.write_text(yaml.dump(settings, Dumper=_PlainDumper))
 
 
 def read_settings(path: Path) -> dict[str, Any]:
     """
-    :param path: ``args.yml`` or ``config.yml`` of a run
-    :return: what is in it; empty if there is none, or one of another writer, with Python objects in it
+    :param path: Arguments or hyperparameters of a run
+    :return: Their names and values; empty if there is no such file, or one that holds Python objects
     """
     try:
         return dict(yaml.safe_load(path.read_text()) or {})
@@ -45,19 +76,19 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 def run_arguments(run: Path) -> dict[str, Any]:
     """The command-line arguments of a run; empty if they were not recorded."""
-    files = sorted(run.glob("*/args.yml"))
+    files = sorted(run.glob(f"*/{ARGUMENTS}"))
     return read_settings(files[0]) if files else {}
 
 
 def the_run(folder: Path) -> Path:
     """A run's folder, or the single run below a folder, as suites have them; the folder itself if there is none or many."""
-    below = [] if any(folder.glob("*/args.yml")) else list(folder.glob("*/*/*/args.yml"))
+    below = [] if any(folder.glob(f"*/{ARGUMENTS}")) else list(folder.glob(f"*/*/*/{ARGUMENTS}"))
     return below[0].parent.parent if len(below) == 1 else folder
 
 
 def is_finished(run: Path, env_id: str) -> bool:
     """Whether a run has its last model and no checkpoint to go on from."""
-    return (run / f"{env_id}.zip").exists() and not (run / CHECKPOINTS).exists()
+    return (run / last_model(env_id)).exists() and not (run / CHECKPOINTS).exists()
 
 
 def read_evaluations(run: Path) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from rich.table import Column, Table
 
 from sb3_por.analysis.scores import read_scores, write_csv
 from sb3_por.common.errors import UserError
-from sb3_por.runs.folder import read_settings
+from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, LOCK, read_settings
 from sb3_por.suites.pools import LocalPool, Pool
 from sb3_por.suites.suite_file import Run, Suite, read_suite, suite_runs
 
@@ -43,7 +43,7 @@ def run_suite(path: str | Path, root: str | Path = "runs", dry_run: bool = False
         return 0
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(folder / ".lock", timeout=0):
+        with FileLock(folder / LOCK, timeout=0):
             return _do(_pool(suite, runs, ray), folder)
     except Timeout as error:
         raise UserError(f"another process is at work on the suite in {folder}; wait for it, or give another --root") from error
@@ -67,7 +67,7 @@ def _do(pool: Pool, folder: Path) -> int:
     finally:
         signal.signal(signal.SIGTERM, handler)
     console.print(progress_table(pool))
-    if any(run.run_folder.joinpath("evaluations.npz").exists() for run in pool.runs):
+    if any(run.run_folder.joinpath(EVALUATIONS).exists() for run in pool.runs):
         write_csv(read_scores([folder]), folder / "scores.csv")
         print(folder / "scores.csv")
     return _name_failed(pool)
@@ -150,4 +150,4 @@ def _total_steps(run: Run) -> int:
     """Steps of a whole run; 0 as long as only its settings say it and it has not written them."""
     if "-n" in run.flags:
         return int(run.flags[run.flags.index("-n") + 1])
-    return int(read_settings(run.run_folder / run.env / "config.yml").get("n_timesteps") or 0)
+    return int(read_settings(run.run_folder / run.env / HYPERPARAMETERS).get("n_timesteps") or 0)

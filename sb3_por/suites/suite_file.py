@@ -11,7 +11,7 @@ import yaml
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por.common.errors import UserError, check_known, one_line
 from sb3_por.evaluation.loading import LOADABLE, import_packages
-from sb3_por.runs.folder import is_finished, run_arguments
+from sb3_por.runs.folder import LOG, is_finished, run_arguments
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Run:
 
     @property
     def log(self) -> Path:
-        return self.folder / "log.txt"
+        return self.folder / LOG
 
     def state(self) -> str:
         """``"finished"``, ``"interrupted"``, or ``"new"``."""

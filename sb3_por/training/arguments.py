@@ -19,7 +19,7 @@ from sb3_por.runs.checkpoints import (
     latest_checkpoint,
     remove_checkpoints,
 )
-from sb3_por.runs.folder import run_arguments, the_run
+from sb3_por.runs.folder import ARGUMENTS, last_model, run_arguments, the_run
 from sb3_por.runs.provenance import current_commit, current_machine
 
 EXAMPLE = """example:
@@ -105,8 +105,8 @@ class Parser(argparse.ArgumentParser):
         run = the_run(run)
         saved = run_arguments(run)
         if "env" not in saved:
-            raise UserError(f"{run} is not the folder of a run: no */args.yml in it; give <log-folder>/<algo>/<env>_<n>")
-        if (run / f"{saved['env']}.zip").exists() and latest_checkpoint(run) is None:
+            raise UserError(f"{run} is not the folder of a run: no */{ARGUMENTS} in it; give <log-folder>/<algo>/<env>_<n>")
+        if (run / last_model(saved["env"])).exists() and latest_checkpoint(run) is None:
             remove_checkpoints(run)  # what is left of them if the run was killed while it removed them
             print(f"{run} is finished: nothing to do (train.py -i MODEL.zip begins a new run with its model)")
             raise SystemExit(0)

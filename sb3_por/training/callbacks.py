@@ -12,7 +12,7 @@ from sb3_por.common.files import atomic_write
 from sb3_por.common.random_state import set_rng_state
 from sb3_por.evaluation.episodes import Episode, Evaluation, run_episodes, score
 from sb3_por.runs.checkpoints import save_checkpoint
-from sb3_por.runs.folder import EVALUATIONS
+from sb3_por.runs.folder import BEST_MODEL, EVALUATIONS, intermediate_model
 
 
 def is_due(callback: BaseCallback, interval: int) -> bool:
@@ -120,7 +120,7 @@ class EvaluationCallback(EvalCallback):
         if evaluation.score > self.best_mean_reward:
             # SB3 calls the number that models are ranked by a reward, and other callbacks read it under that name.
             self.best_mean_reward = evaluation.score
-            with atomic_write(self.run / "best_model.zip") as path:
+            with atomic_write(self.run / BEST_MODEL) as path:
                 self.model.save(path)
             if self.callback_on_new_best is not None:
                 go_on = self.callback_on_new_best.on_step()
@@ -205,7 +205,7 @@ class CheckpointCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self._count_due() > self._n_due:
             self._n_due = self._count_due()
-            with atomic_write(self.run / f"rl_model_{self.model.num_timesteps}_steps.zip") as path:
+            with atomic_write(self.run / intermediate_model(self.model.num_timesteps)) as path:
                 self.model.save(path)
             self._save_checkpoint()
         if self.stop_requested:

@@ -25,6 +25,7 @@ from sb3_por.common.files import atomic_write, remove_unfinished
 from sb3_por.evaluation.episodes import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
 from sb3_por.evaluation.loading import quiet_n_steps
 from sb3_por.runs.checkpoints import (
+    MODEL,
     latest_checkpoint,
     read_rng_state,
     read_seconds,
@@ -32,7 +33,19 @@ from sb3_por.runs.checkpoints import (
     restore_buffer,
     restore_monitors,
 )
-from sb3_por.runs.folder import BEST_STATISTICS, read_settings, write_settings
+from sb3_por.runs.folder import (
+    ARGUMENTS,
+    BEST_STATISTICS,
+    COMMAND,
+    HYPERPARAMETERS,
+    LOCK,
+    REPLAY_BUFFER,
+    STATISTICS,
+    TENSORBOARD,
+    last_model,
+    read_settings,
+    write_settings,
+)
 from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
 
 
@@ -66,7 +79,7 @@ class Experiment(ExperimentManager):
         self._resumed_run = Path(self.args.resume) if self.args.resume else None
         self._checkpoint = latest_checkpoint(self._resumed_run) if self._resumed_run else None
         if self._checkpoint:
-            self.trained_agent = str(self._checkpoint / "model.zip")
+            self.trained_agent = str(self._checkpoint / MODEL)
             self.continue_training = True
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -77,7 +90,7 @@ class Experiment(ExperimentManager):
         if self._resumed_run is None:
             hyperparams, saved = super().read_hyperparameters()
         else:
-            saved = read_settings(self._resumed_run / self.env_name / "config.yml") | changes
+            saved = read_settings(self._resumed_run / self.env_name / HYPERPARAMETERS) | changes
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         held_out = evaluation_kwargs(self.env_name.gym_id)
@@ -107,11 +120,11 @@ class Experiment(ExperimentManager):
             if self._checkpoint is not None:
                 restore_monitors(self._resumed_run, self._checkpoint)
         if self.tensorboard_log is None and not self.optimize_hyperparameters:
-            self.tensorboard_log = os.path.join(self.save_path, "tb")
+            self.tensorboard_log = os.path.join(self.save_path, TENSORBOARD)
 
     def _lock_folder(self) -> None:
         """Two processes must not write one run. The system frees the lock of a killed one."""
-        self._lock = FileLock(os.path.join(self.save_path, ".lock"))
+        self._lock = FileLock(os.path.join(self.save_path, LOCK))
         try:
             self._lock.acquire(timeout=0)
         except Timeout as error:
@@ -180,10 +193,10 @@ class Experiment(ExperimentManager):
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         """Plain YAML; the zoo writes Python objects, which only an unsafe loader reads."""
-        write_settings(Path(self.params_path) / "config.yml", dict(sorted(saved_hyperparams.items())))
-        write_settings(Path(self.params_path) / "args.yml", dict(sorted({**vars(self.args), "resume": None}.items())))
+        write_settings(Path(self.params_path) / HYPERPARAMETERS, dict(sorted(saved_hyperparams.items())))
+        write_settings(Path(self.params_path) / ARGUMENTS, dict(sorted({**vars(self.args), "resume": None}.items())))
         if self._resumed_run is None:
-            (Path(self.params_path) / "command.txt").write_text(" ".join(sys.orig_argv))
+            (Path(self.params_path) / COMMAND).write_text(" ".join(sys.orig_argv))
         print(f"Log path: {self.save_path}")
 
     def learn(self, model: BaseAlgorithm) -> None:
@@ -236,14 +249,14 @@ class Experiment(ExperimentManager):
             # A model without a checkpoint is what marks a finished run.
             raise KeyboardInterrupt(go_on)
         save: Callable[[Path], Any] = model.save
-        with atomic_write(Path(self.save_path) / f"{self.env_name}.zip") as path:
+        with atomic_write(Path(self.save_path) / last_model(str(self.env_name))) as path:
             save(path)
         if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
-            with atomic_write(Path(self.save_path) / "replay_buffer.pkl") as path:
+            with atomic_write(Path(self.save_path) / REPLAY_BUFFER) as path:
                 model.save_replay_buffer(path)
         statistics = model.get_vec_normalize_env()
         if statistics is not None:
-            statistics.save(os.path.join(self.params_path, "vecnormalize.pkl"))
+            statistics.save(os.path.join(self.params_path, STATISTICS))
         print(f"Saved to {self.save_path}")
         if self._interrupted:
             raise KeyboardInterrupt(go_on)

@@ -1,7 +1,9 @@
 """Set-up, saving and loading of the visual algorithms."""
 
 import io
+import math
 import pathlib
+import sys
 import warnings
 from typing import Any, ClassVar
 
@@ -15,12 +17,25 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_por.acceleration.overlap import OverlappedTraining
 from sb3_por.acceleration.precision import check_precision
 from sb3_por.acceleration.updates import AcceleratedUpdates
+from sb3_por.common.checks import check_ranges, check_types
 from sb3_por.common.random_state import SavedRandomState
 from sb3_por.common.running_means import RunningMeans
 from sb3_por.objectives.base import Objective
 from sb3_por.visual.batch import Augmentation
 from sb3_por.visual.normalization import transpose_inside
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
+
+#: Smallest and largest value of each numeric argument
+RANGES: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("tau", "encoder_tau", "gamma"), (0, 1)),
+    **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "train_freq"), (1, math.inf)),
+    **dict.fromkeys(("actor_update_interval", "target_update_interval", "diagnostics_interval"), (1, math.inf)),
+    **dict.fromkeys(("n_augmentations", "n_target_augmentations"), (1, math.inf)),
+    **dict.fromkeys(("learning_rate", "learning_starts", "augmentation_pad", "por_coef"), (0, math.inf)),
+    **dict.fromkeys(("ent_coef_lr_ratio", "aux_lr_ratio", "ent_coef"), (0, math.inf)),
+    "gradient_steps": (-1, math.inf),
+    "reward_scale": (-sys.float_info.max, sys.float_info.max),
+}
 
 
 class VisualAlgorithm(OverlappedTraining, SavedRandomState):
@@ -66,7 +81,7 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
     batch_norm_stats_target: list[th.Tensor]
 
     def _setup_model(self) -> None:
-        check_precision(self.precision)
+        self._check_arguments()
         if self.start_at_mean_reward and self.gamma >= 1.0:
             raise ValueError("start_at_mean_reward needs gamma < 1: without a discount, the sum of all rewards is infinite")
         self._check_class()
@@ -94,6 +109,17 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         self._acceleration = AcceleratedUpdates(self.policy, self.precision, self.compile_mode)
         self._augmentation = Augmentation(self.policy, self.augmentation_pad)
         self._metrics = RunningMeans()
+
+    def _check_arguments(self) -> None:
+        """
+        :raises TypeError: If an argument has the wrong type
+        :raises ValueError: If a number is out of its range
+        """
+        # Not those that SB3 has replaced by objects
+        values = {name: value for name, value in vars(self).items() if name not in ("env", "policy", "device")}
+        check_types(type(self), values)
+        check_ranges(values, RANGES)
+        check_precision(self.precision)
 
     def _check_class(self) -> None:
         """

@@ -25,11 +25,10 @@ def transpose_inside(env: VecEnv) -> VecEnv:
     space = env.venv.observation_space
     images = [key for key, part in _parts(space).items() if is_image_space(part)]
     normalized = (env.norm_obs_keys or [""]) if env.norm_obs else []
-    # By their shape: VecNormalize has replaced the spaces of images that it normalizes
-    if any(len(_parts(space)[key].shape or ()) == 3 for key in normalized):
+    if any(_has_channels_last(_parts(space)[key]) for key in normalized):
         raise ValueError(
-            "VecNormalize would normalize images, which encoders scale themselves: use norm_obs=False, or norm_obs_keys "
-            "without the images."
+            "VecNormalize would normalize images with channels last, and what it returns is not known to be an image: use "
+            "norm_obs=False, norm_obs_keys without the images, or VecTransposeImage inside of it."
         )
     inner = BaseAlgorithm._wrap_env(env.venv)
     if inner is not env.venv:
@@ -41,6 +40,12 @@ def transpose_inside(env: VecEnv) -> VecEnv:
             else inner.observation_space
         )
     return env
+
+
+def _has_channels_last(space: spaces.Space) -> bool:
+    """By its shape: ``VecNormalize`` replaces the spaces of images that it normalizes."""
+    shape = space.shape or ()
+    return len(shape) == 3 and shape[0] != min(shape)
 
 
 def _parts(space: spaces.Space) -> dict[str, spaces.Space]:

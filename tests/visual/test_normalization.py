@@ -9,7 +9,6 @@ from sb3_por import SACPOR
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 
 POLICY = dict(net_arch=[8], features_extractor_kwargs=dict(n_filters=4, strides=(2, 2)))
-DICT_POLICY = dict(net_arch=[8], features_extractor_kwargs=dict(n_filters=4, strides=(2, 2)))
 
 
 def envs(obs_type="pixels"):
@@ -55,9 +54,9 @@ def test_vectors_beside_images_are_normalized():
 
 
 @pytest.mark.parametrize("kwargs", [dict(), dict(norm_obs_keys=["image"])])
-def test_images_must_not_be_normalized(kwargs):
+def test_images_with_channels_last_must_not_be_normalized(kwargs):
     obs_type, policy = ("dict", "MultiInputPolicy") if kwargs else ("pixels", "CnnPolicy")
-    with pytest.raises(ValueError, match=r"norm_obs=False, or norm_obs_keys"):
+    with pytest.raises(ValueError, match=r"norm_obs=False, norm_obs_keys without the images"):
         make(VecNormalize(envs(obs_type), **kwargs), policy)
 
 

@@ -10,6 +10,7 @@ from torch import nn
 from sb3_por.acceleration.allocator import keep_freed_memory
 from sb3_por.acceleration.compile import compiled_forwards
 from sb3_por.acceleration.precision import allow_tf32, in_bfloat16
+from sb3_por.acceleration.threads import use_one_thread
 from sb3_por.acceleration.transfer import without_waiting
 
 
@@ -29,6 +30,7 @@ class AcceleratedUpdates:
         # Module: what its forward function is during updates
         self._forwards: dict[nn.Module, Callable[..., Any]] = {}
         if self._device.type == "cpu":
+            use_one_thread()
             keep_freed_memory()
         if precision == "tf32":
             allow_tf32()

@@ -45,8 +45,8 @@ class OverlappedTraining(OffPolicyAlgorithm):
 
     def _defer(self, gradient_steps: int) -> bool:
         """
-        :param gradient_steps: Number of updates that ``train()`` is asked for
-        :return: Whether they are made later, in the first step of the next rollout
+        :param gradient_steps: Number of updates that are due now
+        :return: Whether they are deferred to the first step of the next rollout
         """
         deferred, self._defers_updates = self._defers_updates, False
         self._updates_due += gradient_steps * deferred

@@ -10,7 +10,7 @@ PRECISIONS = ("float32", "tf32", "bfloat16")
 
 def check_precision(precision: str) -> None:
     """
-    :param precision: What the user asked for
+    :param precision: Name of a precision
     :raises ValueError: If there is no such precision
     """
     if precision not in PRECISIONS:
@@ -31,7 +31,7 @@ def in_bfloat16(forward: Callable[..., th.Tensor], device: th.device) -> Callabl
     """
 
     def wrapped(*args: Any) -> th.Tensor:
-        # Without the cache, which would keep weights that were cast where no gradient was wanted
+        # The cache would keep weights that were cast without gradient
         with th.autocast(device.type, th.bfloat16, cache_enabled=False):
             return forward(*args).float()
 

@@ -4,7 +4,7 @@ import os
 
 import torch as th
 
-#: PyTorch's default, a thread for every core, unless the user has changed it before
+#: PyTorch's default (a thread for every core), or the user's choice before the import
 _DEFAULT = th.get_num_threads()
 _is_first = True
 

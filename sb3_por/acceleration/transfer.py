@@ -10,10 +10,10 @@ from torch.distributions import Distribution
 @contextmanager
 def without_waiting(device: th.device) -> Iterator[None]:
     """
-    Distributions do not check their arguments where the host would have to wait for the device to see the result of the
-    check. They do on a CPU; and those of actions that a policy takes, which the host has to wait for anyway, do everywhere.
+    A context without the argument checks of ``torch.distributions`` on devices other than the CPU: the host would wait for the
+    result of each check.
 
-    :param device: Where the distributions are
+    :param device: Device of the distributions
     """
     before = Distribution._validate_args
     Distribution.set_default_validate_args(before and device.type == "cpu")
@@ -25,19 +25,20 @@ def without_waiting(device: th.device) -> Iterator[None]:
 
 def to_device(tensor: th.Tensor, device: th.device) -> th.Tensor:
     """
-    :param tensor: In the host's memory, or on the device
-    :param device: Where it should be
-    :return: The tensor there. The host waits for copies to itself alone: others come before whatever the device does next
+    :param tensor: Tensor in host memory or on the device
+    :param device: Target device
+    :return: The tensor on the device. Host-to-device copies are asynchronous; device-to-host copies block
     """
     if device.type == "cuda" and tensor.device.type == "cpu":
-        # From memory that can be paged out the copy would wait for the device's earlier work
+        # A copy from pageable memory would wait for earlier work of the device
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=device.type != "cpu")
 
 
 def free_memory(device: th.device) -> int | None:
     """
-    :return: Bytes of the device's own memory that are free; None where it has none, or does not say
+    :param device: A device
+    :return: Free bytes of the device's own memory; None if it has no such memory or does not report it
     """
     if device.type == "cpu":
         return None

@@ -27,7 +27,7 @@ class AcceleratedUpdates:
     def __init__(self, policy: Any, precision: str, compile_mode: str | None):
         self._device: th.device = policy.device
         self._compiles = compile_mode is not None
-        # Module: what its forward function is during updates
+        # Module: its forward function during updates
         self._forwards: dict[nn.Module, Callable[..., Any]] = {}
         if self._device.type == "cpu":
             use_one_thread()
@@ -45,7 +45,7 @@ class AcceleratedUpdates:
     def update(self) -> Iterator[None]:
         """A context around one update."""
         if self._compiles:
-            # CUDA graphs keep what they return until the next update: trunk features are used again
+            # Results of CUDA graphs stay valid until the next update: trunk features are used twice
             th.compiler.cudagraph_mark_step_begin()
         for module, forward in self._forwards.items():
             module.forward = forward  # type: ignore[method-assign]  # not module.compile(), which skips PyTorch's containers

@@ -1,4 +1,4 @@
-"""States of the global random generators, so that a loaded model can go on as if it had never stopped."""
+"""States of the global random generators, with which a loaded model continues as if it had never stopped."""
 
 import io
 import pathlib
@@ -42,15 +42,15 @@ def set_rng_state(state: dict[str, Any], action_space: spaces.Space) -> None:
 
 class SavedRandomState(OffPolicyAlgorithm):
     """
-    A mixin for SB3's algorithms, which saves the states of the random generators with the model. A loaded model that goes on
-    with ``learn(reset_num_timesteps=False)`` takes them up.
+    A mixin that saves the states of the random generators with the model. ``learn(reset_num_timesteps=False)`` of a loaded
+    model restores them.
     """
 
-    #: What a loaded model brought and has not taken up yet.
+    #: States of a loaded model that are not restored yet
     rng_state: dict[str, Any] | None = None
 
     def _setup_model(self) -> None:
-        rng_state = self.rng_state  # a loaded model's; the seed that SB3 sets here is that of its first start
+        rng_state = self.rng_state  # of a loaded model: the seed that SB3 sets here is that of its first start
         super()._setup_model()
         self.rng_state = rng_state
 
@@ -70,14 +70,14 @@ class SavedRandomState(OffPolicyAlgorithm):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
-        :param seed: Seed of the random generators; what a loaded model brought of theirs is forgotten
+        :param seed: Seed of the random generators; discards the states of a loaded model
         """
         super().set_random_seed(seed)
         self.rng_state = None
 
     @classmethod
     def load(cls, *args: Any, **kwargs: Any) -> Any:
-        """See SB3. A model that is given a ``seed`` does not go on with the random numbers of the saved one."""
+        """See SB3. A ``seed`` among the arguments discards the saved states of the random generators."""
         model = super().load(*args, **kwargs)
         if "seed" in kwargs:
             model.rng_state = None
@@ -90,8 +90,7 @@ class SavedRandomState(OffPolicyAlgorithm):
         include: Iterable[str] | None = None,
     ) -> None:
         """
-        Save all attributes, networks, optimizers and the states of the random generators in a zip file. A loaded model
-        that goes on with ``learn(reset_num_timesteps=False)`` takes up these states.
+        Save all attributes, networks, optimizers and the states of the random generators in a zip file.
 
         :param path: Path to the file
         :param exclude: Names of attributes to leave out

@@ -1,10 +1,10 @@
-"""Means of what an update measures, kept on the device until someone reads them."""
+"""Running means that stay on the device until they are read."""
 
 import torch as th
 
 
 class RunningMeans:
-    """Running means of named scalars; what they hold does not grow with the number of values."""
+    """Running means of named scalars, in constant memory."""
 
     def __init__(self) -> None:
         self._sums: dict[str, th.Tensor] = {}
@@ -12,15 +12,17 @@ class RunningMeans:
 
     def add(self, name: str, value: th.Tensor) -> None:
         """
-        :param name: what is measured
-        :param value: a scalar; nothing waits for its device
+        :param name: Name of the metric
+        :param value: A scalar tensor; the host does not wait for it
         """
         value = value.detach().reshape(()).float()
         self._sums[name] = self._sums[name] + value if name in self._sums else value
         self._counts[name] = self._counts.get(name, 0) + 1
 
     def take(self) -> dict[str, float]:
-        """The means of all values since the last time; waits, once, for their device."""
+        """
+        :return: Mean of each metric since the last call; waits for the device, once
+        """
         totals = th.stack(list(self._sums.values())).tolist() if self._sums else []
         means = {name: total / self._counts[name] for name, total in zip(self._sums, totals, strict=True)}
         self._sums.clear()

@@ -20,7 +20,7 @@ class Projection(nn.Module):
     :param block_dims: Size of each block of the trunk's output
     :param features_dim: Size of one projected block
     :param tanh: Squash the features into [-1, 1], as DrQ does and CURL does not
-    :param n_positions: Features before the blocks, which stay as they are
+    :param n_positions: Number of leading features that are not projected
     """
 
     def __init__(self, block_dims: Sequence[int], features_dim: int, tanh: bool = True, n_positions: int = 0):
@@ -41,17 +41,17 @@ class Projection(nn.Module):
 
 class Encoder(BaseFeaturesExtractor):
     """
-    A features extractor in two parts. ``forward`` is the trunk, which actor and critic can share;
-    ``make_projection()`` builds the part that each network owns, so that the actor can train its projection
-    while the trunk stays with the critic (the convention of CURL and DrQ).
+    A features extractor in two parts. ``forward`` is the trunk, which actor and critic can share; ``make_projection()`` builds
+    the part that each network owns, so that the actor trains its projection while the trunk belongs to the critic (the
+    convention of CURL and DrQ).
 
-    ``features_dim`` is the size *after* the projection: what the actor's and the critic's heads receive.
+    ``features_dim`` is the size *after* the projection: the input of the actor's and the critic's heads.
 
     :param observation_space: Observation space
     :param block_dims: Size of each block of the trunk's output
     :param features_dim: Size of one projected block
     :param tanh: Squash the projected features into [-1, 1]
-    :param n_positions: Features before the blocks, which are not projected
+    :param n_positions: Number of leading features that are not projected
     """
 
     def __init__(
@@ -92,8 +92,8 @@ def delta_orthogonal_(weight: th.Tensor, gain: float) -> None:
 
 class CenteredConv2d(nn.Conv2d):
     """
-    A convolution, without padding, of images in [0, 1] minus one half. The subtraction is one of sums of weights and costs
-    no pass over the images.
+    A convolution, without padding, of images in [0, 1] minus one half. The subtraction is folded into the bias and costs no
+    pass over the images.
     """
 
     def forward(self, images: th.Tensor) -> th.Tensor:
@@ -102,26 +102,26 @@ class CenteredConv2d(nn.Conv2d):
 
 
 def _from_middle(n: int) -> th.Tensor:
-    """Places of ``n`` pixels in a row."""
+    """Positions of ``n`` pixels in a row, relative to their middle."""
     return th.arange(n) - (n - 1) / 2
 
 
 class SpatialSoftmax(nn.Module):
     """
-    Where each map is large: mean and covariance of the position under a softmax over its pixels, with a learned temperature a
-    map. Means are the feature points of https://arxiv.org/abs/1504.00702; two things that look the same have one mean,
-    and their distance and direction are in the covariance. The temperature is in units of the map's standard deviation over
-    its pixels: however weak a filter's response is, the positions vary with what it sees.
+    Position of each map's large values: mean and covariance under a softmax over its pixels, with a learned temperature for
+    each map. The means are the feature points of https://arxiv.org/abs/1504.00702. Two objects that look the same share one
+    mean; the covariance holds their distance and direction. The temperature is in units of the map's standard deviation over
+    its pixels, so that positions vary even where a filter responds weakly.
 
     :param n_maps: Number of maps
-    :param height: Of a map, pixels
-    :param width: Of a map, pixels
-    :param temperature: At first; standard deviations of a map
+    :param height: Height of a map in pixels
+    :param width: Width of a map in pixels
+    :param temperature: Initial temperature in standard deviations of a map
     """
 
-    #: Features of one map
+    #: Number of features of one map
     N_MOMENTS: ClassVar[int] = 5
-    #: Maps that vary less are not enlarged further
+    #: Smallest standard deviation by which a map is divided
     MIN_DEVIATION: ClassVar[float] = 1e-3
 
     monomials: th.Tensor
@@ -139,11 +139,11 @@ class SpatialSoftmax(nn.Module):
         :return: Means of x (to the right) and y (down), from the middle and in pixels of the maps, variances of x and y, and
             covariance, each of all maps, shape ``(batch, 5 * n_maps)``
         """
-        # Pixels before maps, as channels-last memory has them; in lower precision a variance would be lost in its difference
+        # Pixels before maps, as in channels-last memory; float32, since a variance is a small difference of large numbers
         pixels = maps.permute(0, 2, 3, 1).flatten(1, 2).float()
         with th.autocast(maps.device.type, enabled=False):
             centered = pixels - pixels.mean(dim=1, keepdim=True)
-            # th.var takes nine times as long; a map without any variation has no place, and its shares are equal
+            # th.var takes nine times as long; a constant map has equal shares
             variance = centered.square().mean(dim=1, keepdim=True) + self.MIN_DEVIATION**2
             shares = (centered * (variance.rsqrt() * th.exp(-self.log_temperature))).softmax(dim=1)
             x, y, xx, yy, xy = (self.monomials @ shares).unbind(dim=1)
@@ -190,8 +190,8 @@ def make_conv_trunk(
 class ConvEncoder(Encoder):
     """
     The convolutional encoder of CURL and DrQ: 3x3 convolutions, then Linear -> 50 -> LayerNorm (-> tanh). With
-    ``spatial_softmax`` the features are positions in the image, which tell where small things are after fewer updates;
-    nothing is projected then.
+    ``spatial_softmax`` the features are positions in the image, without a projection; they locate small objects after fewer
+    updates.
 
     :param observation_space: Image space, channels first
     :param features_dim: Size of the projected features; with ``spatial_softmax`` there are ``5 * n_filters`` features
@@ -200,7 +200,7 @@ class ConvEncoder(Encoder):
         the default costs a sixth of it and suits a laptop
     :param tanh: Squash the projected features into [-1, 1]
     :param center: Subtract one half from the images, which are in [0, 1] then
-    :param spatial_softmax: The features are where each filter of the last convolution responds (``SpatialSoftmax``)
+    :param spatial_softmax: Use the positions of the last convolution's responses as features (``SpatialSoftmax``)
     :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
     """
 
@@ -242,7 +242,7 @@ def make_vector_trunk(in_dim: int, hidden_dim: int) -> nn.Sequential:
 
 class VectorEncoder(Encoder):
     """
-    A small MLP for everything that is not an image.
+    A small MLP for observations other than images.
 
     :param observation_space: Observation space
     :param features_dim: Size of the projected features

@@ -23,8 +23,8 @@ LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 
 class VisualActor(Actor):
     """
-    SAC's actor on the features of a trunk: it projects them itself, and squashes the log standard deviation with tanh
-    as CURL and DrQ do. Takes the arguments of SB3's SAC actor.
+    SAC's actor on trunk features, with a projection of its own and a tanh on the log standard deviation, as in CURL and DrQ.
+    Takes the arguments of SB3's SAC actor.
 
     :param detach_trunk: Stop the gradient after the trunk, which belongs to the critic
     """
@@ -34,7 +34,7 @@ class VisualActor(Actor):
         self.detach_trunk = detach_trunk
         self.projection = make_projection(self.features_extractor)
         if not self.use_sde:
-            # Exploration starts with a standard deviation of about 1, as in SB3, not in the middle of the range, e^-4
+            # Start with a standard deviation of about 1, as SB3 does, instead of e^-4, the middle of the range
             middle, half_range = 0.5 * (LOG_STD_MAX + LOG_STD_MIN), 0.5 * (LOG_STD_MAX - LOG_STD_MIN)
             nn.init.constant_(self.log_std.bias, math.atanh(-middle / half_range))  # type: ignore[attr-defined]
 
@@ -103,7 +103,7 @@ class EncoderOwner(BaseModel):
     A critic that owns an encoder: trunk (``features_extractor``) and ``projection`` together are f_o, and in the target
     critic f_m. A mixin for SB3's critics.
 
-    :param layer_norm: The Q networks have layer norm
+    :param layer_norm: Use layer norm in the Q networks
     """
 
     features_extractor: BaseFeaturesExtractor
@@ -190,20 +190,19 @@ class VisualQuantileCritic(EncoderOwner, QuantileCritic):
 
 class VisualPolicy(BasePolicy):
     """
-    What the visual policies of SAC and TQC have in common. A mixin for SB3's policies; takes their arguments, with the
-    encoder as default features extractor, and
+    A mixin for the policies of SAC and TQC. Takes their arguments, with the encoder as default features extractor, and
 
     :param share_features_extractor: The actor uses the critic's trunk, detached (default). Otherwise it has a trunk of
         its own, trained by its loss
-    :param critic_layer_norm: The Q networks have layer norm, so that their hidden units stay alive and values of actions that
-        were never taken stay bounded (https://arxiv.org/abs/2302.02948)
+    :param critic_layer_norm: Use layer norm in the Q networks: their hidden units stay alive, and values of unseen actions
+        stay bounded (https://arxiv.org/abs/2302.02948)
     :param objective_class: Auxiliary objective, trained together with the critic; None for none
     :param objective_kwargs: Keyword arguments of the objective
     """
 
     critic_class: type[Any]
     default_encoder: type[Encoder]
-    # What SAC's and TQC's policies have in common
+    # Attributes of both SAC's and TQC's policies
     actor: Any
     critic: Any
     critic_target: Any
@@ -298,8 +297,8 @@ class VisualPolicy(BasePolicy):
 
     def preprocess(self, observations: PyTorchObs) -> PyTorchObs:
         """
-        :param observations: Observations as the environment gives them
-        :return: What the trunks take: float, images in [0, 1] with channels last in memory
+        :param observations: Observations as the environment returns them
+        :return: Input of the trunks: float, images in [0, 1] with channels last in memory
         """
         if isinstance(observations, dict):
             return {key: self._preprocess(part, self.observation_space[key]) for key, part in observations.items()}  # type: ignore[index]
@@ -307,10 +306,10 @@ class VisualPolicy(BasePolicy):
 
     def _preprocess(self, part: th.Tensor, space: spaces.Space) -> Any:
         if part.dim() == 4:
-            # As the trunks want images: rearranged once, while they are bytes
+            # The layout of the trunks: images are rearranged once, while they are bytes
             part = part.contiguous(memory_format=th.channels_last)
         if self.normalize_images and part.dtype == th.uint8 and is_image_space(space):
-            # What preprocess_obs does, without a second copy of floats
+            # As preprocess_obs does, without a second copy of floats
             return part.float().div_(255.0)
         return preprocess_obs(part, space, normalize_images=self.normalize_images)
 

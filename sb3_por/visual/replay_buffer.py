@@ -17,20 +17,21 @@ Observations = th.Tensor | TensorDict
 
 class SequenceSamples(NamedTuple):
     """
-    A batch of transitions, as SB3's ``ReplayBufferSamples``, and what follows each of them in its episode.
+    A batch of transitions, as SB3's ``ReplayBufferSamples``, and other frames of their episodes. Frames that were not
+    requested are None.
 
     :param observations: o_t
     :param actions: a_t, of shape ``(batch, action_dim)``
     :param next_observations: o_{t+n} for n-step returns, n smaller where the episode ended earlier
-    :param dones: 1 where the episode terminated (not: was truncated) within these n steps, ``(batch, 1)``
+    :param dones: 1 where the episode terminated within these n steps (truncation does not count), ``(batch, 1)``
     :param rewards: Discounted sum of the n rewards, ``(batch, 1)``
     :param discounts: gamma ** n, ``(batch, 1)``; None for n = 1
-    :param future_observations: o_{t+k}; None if not asked for
-    :param gaps: k of each sample, ``(batch,)``; smaller than asked for where the episode ended earlier
-    :param past_observations: o_{t-k}; None if not asked for
-    :param past_gaps: k of each sample, ``(batch,)``; smaller than asked for where the episode began later, 0 for its first
-        frame
-    :param window_observations: o_{t+1} .. o_{t+K}, ``(batch, K, ...)``; None if not asked for
+    :param future_observations: o_{t+k}
+    :param gaps: k of each sample, ``(batch,)``; smaller than requested near the end of the episode
+    :param past_observations: o_{t-k}
+    :param past_gaps: k of each sample, ``(batch,)``; smaller than requested near the start of the episode, 0 for its
+        first frame
+    :param window_observations: o_{t+1} .. o_{t+K}, ``(batch, K, ...)``
     :param window_actions: a_t .. a_{t+K-1}, ``(batch, K, action_dim)``
     :param window_mask: 1 where a step of the window belongs to the episode, ``(batch, K)``; the others repeat the last
     """
@@ -52,15 +53,15 @@ class SequenceSamples(NamedTuple):
 
 class FrameStore:
     """
-    Frames addressed by row numbers: a ring of fixed size, then loose rows for the frames that the ring has no place
-    for (the last frame of each episode and the newest frame of each environment). Images have channels last, as
-    augmentation and convolutions want them in memory.
+    Frames addressed by row numbers: a ring of fixed size, then loose rows for the frames outside of the ring (the last frame
+    of each episode and the newest frame of each environment). Images have channels last in memory, the layout of augmentation
+    and convolutions.
 
     :param n_ring: Rows of the ring
-    :param n_loose: Loose rows to begin with; their number grows
+    :param n_loose: Initial number of loose rows; it grows
     :param shape: Shape of one frame
     :param dtype: Type of the frames
-    :param device: Where to keep the frames
+    :param device: Device of the frames
     """
 
     def __init__(self, n_ring: int, n_loose: int, shape: tuple[int, ...], dtype: np.dtype, device: th.device):
@@ -68,7 +69,7 @@ class FrameStore:
         self.shape = shape
         self.is_image = len(shape) == 3
         in_memory = (*shape[1:], shape[0]) if self.is_image else shape
-        # Zeros from numpy take memory only once they are written to
+        # numpy's zeros take no memory until they are written to
         self.ring = th.from_numpy(np.zeros((n_ring, *in_memory), dtype)).to(device)
         self.loose = th.from_numpy(np.zeros((n_loose, *in_memory), dtype)).to(device)
         self.n_written = 0
@@ -93,7 +94,7 @@ class FrameStore:
     def copy_loose(self, source: int, target: int) -> None:
         """
         :param source: Loose row to copy from
-        :param target: Loose row to copy to; there are twice as many loose rows from now on if it is beyond the last
+        :param target: Loose row to copy to; the number of loose rows doubles if it is beyond the last
         """
         if target - self.n_ring >= len(self.loose):
             self.loose = th.cat([self.loose, th.zeros_like(self.loose)])
@@ -102,7 +103,7 @@ class FrameStore:
     def gather(self, rows: np.ndarray) -> th.Tensor:
         """
         :param rows: Row numbers of any shape
-        :return: New tensor of shape ``(*rows.shape, *frame shape)`` where the frames are kept
+        :return: New tensor of shape ``(*rows.shape, *frame shape)`` on the device of the frames
         """
         flat = rows.reshape(-1)
         is_loose = np.flatnonzero(flat >= self.n_ring)
@@ -125,7 +126,7 @@ class FrameStore:
         return self._as_shape(self.ring).cpu().numpy()
 
     def __getstate__(self) -> dict[str, Any]:
-        # Only what was written, and no device: a buffer from a GPU can be read without one
+        # Rows that were written, in host memory: a buffer from a GPU can be read without one
         ring, loose = self.ring[: self.n_written].cpu().numpy(), self.loose.cpu().numpy()
         return dict(n_ring=self.n_ring, shape=self.shape, ring=ring, loose=loose, device=str(self.ring.device))
 
@@ -153,12 +154,12 @@ class SequenceReplayBuffer(NStepReplayBuffer):
     :param action_space: Action space
     :param device: PyTorch device of the samples
     :param n_envs: Number of parallel environments
-    :param optimize_memory_usage: Changes nothing: memory is always used sparingly
-    :param handle_timeout_termination: Treat time limits as truncation, not as termination
+    :param optimize_memory_usage: No effect: each frame is always stored once
+    :param handle_timeout_termination: Treat time limits as truncation instead of termination
     :param n_steps: Number of steps of the returns
     :param gamma: Discount factor of the n-step returns
-    :param storage: Where to keep the frames: ``"cpu"``, ``"cuda"``, or ``"auto"``: in GPU memory if the samples go
-        there and the frames take no more than 40 % of what is free
+    :param storage: Memory of the frames: ``"cpu"``, ``"cuda"``, or ``"auto"``: that of the GPU if the samples go there and the
+        frames take no more than 40 % of its free memory
     :raises ValueError: If the frames do not fit into memory
     """
 
@@ -183,7 +184,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         self.n_steps = n_steps
         self.gamma = gamma
 
-        # A space that is not a Dict is a Dict with one entry in here
+        # Internally, any other space is a Dict with one entry
         self.is_dict = isinstance(observation_space, spaces.Dict)
         self._spaces = dict(observation_space.spaces) if self.is_dict else {"": observation_space}  # type: ignore[attr-defined]
         self._shapes: dict[str, Any] = dict(self.obs_shape) if self.is_dict else {"": self.obs_shape}  # type: ignore[arg-type]
@@ -298,7 +299,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
             self.pos = 0
 
     def _end_interrupted_episodes(self, frames: dict[str, np.ndarray]) -> None:
-        """Where an environment does not go on from its newest frame it was reset in between, for example by ``learn()``."""
+        """An environment that does not continue from its newest frame was reset in between, for example by ``learn()``."""
         for env in np.flatnonzero(~self.ended[self.pos - 1]):
             if not all(np.array_equal(frames[key][env], self._newest_obs[key][env]) for key in frames):
                 self._end_episode(self.pos - 1, int(env))

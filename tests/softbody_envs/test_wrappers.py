@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from softbody_envs.wrappers import ActionRepeat
+from softbody_envs.experts import make_expert
+from softbody_envs.wrappers import ActionRepeat, ProgressReward
 
 ID = "PourWater-v0"
 
@@ -57,3 +58,30 @@ def test_it_is_a_gymnasium_environment_with_a_spec():
     check_env(env, skip_render_check=True)
     again = gym.make(env.spec)
     assert isinstance(again, ActionRepeat) and (again.repeat, again.scale) == (5, 0.5)
+
+
+@pytest.mark.parametrize("wrap", [ProgressReward, lambda env: ProgressReward(ActionRepeat(env, 2, 0.5))])
+def test_the_sum_of_the_progress_is_the_final_performance(wrap):
+    env, expert = wrap(gym.make("StraightenRope-v0", obs_type="state")), make_expert("StraightenRope-v0")
+    observation, info = env.reset(options={"variation": 3})
+    expert.reset()
+    rewards, done = [], False
+    while not done:
+        observation, reward, _, done, info = env.step(expert.act(observation))
+        rewards.append(reward)
+    assert sum(rewards) == pytest.approx(10.0 * info["normalized_performance"])
+    assert abs(info["normalized_performance"]) > 0.1
+
+
+def test_an_episode_does_not_inherit_the_performance_of_the_last_one():
+    env = ProgressReward(gym.make("StraightenRope-v0", obs_type="state"), scale=1.0)
+    for variation in (1, 2):
+        _, before = env.reset(options={"variation": variation})
+        _, reward, _, _, after = env.step(np.ones(env.action_space.shape, np.float32))
+        assert reward == pytest.approx(after["normalized_performance"] - before["normalized_performance"])
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
+def test_a_scale_that_is_not_positive_is_refused(scale):
+    with pytest.raises(ValueError, match="scale must be above 0"):
+        ProgressReward(gym.make(ID, obs_type="state"), scale)

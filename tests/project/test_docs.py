@@ -1,11 +1,15 @@
-"""The tables of the documents say what the committed results say."""
+"""The tables of the documents are those of the committed results, and their links lead somewhere."""
 
 import importlib.util
+import re
+import subprocess
 from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = subprocess.run(["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
 
 
 @pytest.fixture(scope="module")
@@ -28,3 +32,20 @@ def test_a_table_that_says_something_else_is_replaced(make_results):
     filled = make_results.fill_in(page)
     assert filled.startswith("before\n<!-- table: leak -->\n\n| ") and filled.endswith(" |\n\n<!-- end -->\nafter\n")
     assert "| 1 |" not in filled and "`SwingingBall-v0`" in filled
+
+
+def anchors(page):
+    """Anchors of a page's titles, as code hosts make them."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_lead_somewhere(name):
+    page = ROOT / name
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if not target.startswith(("http", "mailto:")):
+            file, _, anchor = target.partition("#")
+            linked = (page.parent / file) if file else page
+            assert linked.exists(), target
+            assert not anchor or anchor in anchors(linked), target

@@ -78,18 +78,18 @@ def _evaluate(args: argparse.Namespace) -> None:
 
 def _enjoy_arguments(parser: argparse.ArgumentParser) -> None:
     _model_arguments(parser)
-    parser.add_argument("-o", "--output", required=True, help="the film: .gif or .mp4")
+    parser.add_argument("-o", "--output", required=True, help="the video: .gif or .mp4")
     parser.add_argument("-n", "--n-episodes", type=int, default=1, help="held-out episodes (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--size", type=int, default=480, help="height and width in pixels (default 480)")
 
 
 def _enjoy(args: argparse.Namespace) -> None:
-    from sb3_por.evaluation.video import check_film, film
+    from sb3_por.evaluation.video import check_video, record_video
 
-    check_film(args.output)
+    check_video(args.output)
     model, environment = _load(args)
-    print(film(model, args.env, args.output, args.n_episodes, args.seed, args.size, **environment))
+    print(record_video(model, args.env, args.output, args.n_episodes, args.seed, args.size, **environment))
     print(args.output)
 
 
@@ -218,7 +218,7 @@ def _report_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--metric", choices=METRICS, help="what to compare (default: the first that is recorded)")
     step = "compare at this step, and leave out runs that end before (default: the end of the shortest run)"
     parser.add_argument("--step", type=int, help=step)
-    parser.add_argument("--no-films", action="store_true", help="do not play the best models: much quicker")
+    parser.add_argument("--no-videos", action="store_true", help="leave out videos and saliency maps: much quicker")
     parser.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default 0)")
 
 
@@ -226,7 +226,7 @@ def _report(args: argparse.Namespace) -> None:
     import softbody_envs  # noqa: F401  (registers its ids)
     from sb3_por.analysis.report import write_report
 
-    print(write_report(args.paths, args.output, args.metric, args.step, args.seed, films=not args.no_films))
+    print(write_report(args.paths, args.output, args.metric, args.step, args.seed, videos=not args.no_videos))
 
 
 COMMANDS = {
@@ -237,7 +237,7 @@ COMMANDS = {
         run=_evaluate,
     ),
     "enjoy": Command(
-        help="film a model at work",
+        help="record a video of a model",
         example="--model logs/sac_por/PourWater-v0_1 --env PourWater-v0 -o pour.gif",
         add_arguments=_enjoy_arguments,
         run=_enjoy,
@@ -267,7 +267,7 @@ COMMANDS = {
         run=_suite,
     ),
     "report": Command(
-        help="write a page with what a set of runs was and has shown: figures, tables, films, settings, failures",
+        help="write a page with what a set of runs was and has shown: figures, tables, videos, settings, failures",
         example="runs/smoke -o report",
         add_arguments=_report_arguments,
         run=_report,

@@ -22,7 +22,7 @@ from sb3_por.analysis.scores import METRICS, RUN_KEYS, join_runs, read_csv, read
 from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write, check_writable
 from sb3_por.evaluation.loading import LOADABLE, find_environment, load_model, trained_in
-from sb3_por.evaluation.video import film
+from sb3_por.evaluation.video import record_video
 from sb3_por.runs.facts import RunFacts, orphaned_logs, take_inventory
 from sb3_por.runs.folder import EVALUATIONS
 
@@ -31,8 +31,8 @@ FIGURES = "figures"
 TEMPLATE = "report.html.jinja"
 #: Printed where there is no number.
 NOTHING = "-"
-#: Height and width of the films: small, since a page holds one for each task and algorithm.
-FILM_SIZE = 200
+#: Height and width of the videos: small, since a page holds one for each task and algorithm.
+VIDEO_SIZE = 200
 #: Of tables that hold curves the page shows each curve's end; these columns name the curve. The whole is in the .csv.
 CURVES = {"iqm": ["algo"], "tasks": ["env", "algo"], "order": ["env", "algo", "metric"]}
 #: Tables that a reader has nothing of.
@@ -75,7 +75,7 @@ def write_report(
     metric: str | None = None,
     step: int | None = None,
     seed: int = 0,
-    films: bool = True,
+    videos: bool = True,
 ) -> Path:
     """
     :param paths: run folders, folders that hold runs at any depth, and tables of scores (``.csv``), in any mixture
@@ -84,7 +84,7 @@ def write_report(
     :param metric: what to compare; by default the first of ``METRICS`` that is recorded
     :param step: see :func:`sb3_por.analysis.learning_curves.read_grid`
     :param seed: of the bootstrap
-    :param films: play the best models, and draw what their classifiers look at, which takes some seconds each
+    :param videos: play the best models, and draw what their classifiers look at, which takes some seconds each
     :return: the page
     :raises UserError: if there is neither a run nor a score
     """
@@ -104,7 +104,7 @@ def write_report(
     shown: dict[str, list[Picture]] = {}
     notes: list[str] = []
     if not runs:
-        notes.append("made from scores alone: only run folders tell settings, machines and failures, and hold models to film")
+        notes.append("made from scores alone: only run folders tell settings, machines and failures, and hold models")
     if scores is None:
         notes.append("no run was evaluated: there is nothing to plot")
     else:
@@ -112,7 +112,7 @@ def write_report(
         plots, left_out = plot_all(scores, find_order([run.folder for run in _evaluated(runs)]), metric, step, seed=seed)
         notes += left_out
         save_all(plots, folder / FIGURES)
-        if films:
+        if videos:
             shown = _show_models(_best_runs(runs, scores, metric), notes)
     page = _template().render(
         title=", ".join((path.parent if path.suffix == ".csv" else path).resolve().name for path in given),
@@ -124,7 +124,7 @@ def write_report(
         machines=sorted({run.machine for run in runs} - {""}),
         settings=_settings(runs),
         sections=[_section(one, folder / FIGURES) for one in plots],
-        films=shown,
+        videos=shown,
         unfinished=[run for run in runs if run.state != "finished"],
         orphans=orphans,
         notes=notes,
@@ -220,18 +220,18 @@ def _best_runs(runs: list[RunFacts], scores: pd.DataFrame, metric: str) -> Itera
 
 def _show_models(best: Iterator[tuple[str, str, RunFacts, float]], notes: list[str]) -> dict[str, list[Picture]]:
     """
-    Task -> a film of each algorithm's best model, followed by its saliency map if it learns an order from images. What
+    Task -> a video of each algorithm's best model, followed by its saliency map if it learns an order from images. What
     cannot be shown is noted: a page about many runs is not to fail with one of them.
     """
     shown: dict[str, list[Picture]] = {}
     for env, algo, run, score in best:
         with TemporaryDirectory() as folder:
-            path = Path(folder) / "film.gif"
+            path = Path(folder) / "video.gif"
             try:
                 find_environment(env, run.folder)
                 model = load_model(run.folder, algo if algo in LOADABLE else None)
                 environment = trained_in(run.folder, env)
-                film(model, env, path, size=FILM_SIZE, **environment)
+                record_video(model, env, path, size=VIDEO_SIZE, **environment)
                 title = f"{algo}, seed {run.seed}: best of its evaluations {_printed(score)}"
                 shown.setdefault(env, []).append(_picture(title, path))
                 if _learns_order(model):

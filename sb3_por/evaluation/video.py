@@ -1,4 +1,4 @@
-"""A film of a model at work, as GIF or MP4."""
+"""Videos of a model's episodes, as GIF or MP4."""
 
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,18 @@ from softbody_envs.registration import ENV_IDS
 FORMATS = (".gif", ".mp4")
 
 
-def check_film(path: str | Path) -> Path:
+def check_video(path: str | Path) -> Path:
     """
-    :raises UserError: if a film cannot be written under this name
+    Check that a video can be written here.
+
+    :param path: ``.gif`` or ``.mp4``
+    :return: the path
+    :raises UserError: if the format is unknown or the folder cannot be written to
     """
     return check_output(path, FORMATS)
 
 
-def film(
+def record_video(
     model: Model,
     env_id: str,
     path: str | Path,
@@ -35,56 +39,58 @@ def film(
     env_wrapper: EnvWrapper | None = None,
 ) -> Evaluation:
     """
-    Film a model's deterministic policy on the first held-out episodes.
+    Record a model's deterministic policy on the first held-out episodes.
 
     :param model: an SB3 model
     :param env_id: a Gymnasium id
     :param path: ``.gif`` or ``.mp4``
     :param n_episodes: number of episodes, one after the other
     :param seed: seed of the first episode
-    :param size: height and width in pixels, for environments that let it be chosen
-    :param env_kwargs: for the environment's constructor
-    :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
-    :param env_wrapper: what the model was trained inside
-    :return: how the model did
-    :raises UserError: if the environment does not fit the model or draws no images
+    :param size: height and width in pixels, for environments with a ``render_size``
+    :param env_kwargs: arguments of the environment's constructor
+    :param vec_normalize: file of the ``VecNormalize`` statistics from training
+    :param env_wrapper: the wrappers from training
+    :return: the scores of these episodes
+    :raises UserError: if the environment does not fit the model or renders no images
     """
-    path = check_film(path)
+    path = check_video(path)
     if n_episodes < 1:
-        raise UserError(f"a film needs at least 1 episode, got {n_episodes}")
+        raise UserError(f"a video needs at least 1 episode, got {n_episodes}")
     if size < 1:
-        raise UserError(f"a film needs at least 1 pixel, got the size {size}")
-    drawn: dict[str, Any] = {"render_mode": "rgb_array"} | ({"render_size": size} if env_id in ENV_IDS else {})
-    kwargs = (env_kwargs or {}) | drawn
+        raise UserError(f"a video needs at least 1 pixel, got the size {size}")
+    rendering: dict[str, Any] = {"render_mode": "rgb_array"} | ({"render_size": size} if env_id in ENV_IDS else {})
+    kwargs = (env_kwargs or {}) | rendering
 
-    def filmed(env: gym.Env) -> gym.Env:
-        recorded: gym.Env = RenderCollection(env, reset_clean=False)  # innermost: sees every step of an ActionRepeat
-        return recorded if env_wrapper is None else env_wrapper(recorded)
+    def recorded(env: gym.Env) -> gym.Env:
+        innermost: gym.Env = RenderCollection(env, reset_clean=False)  # records every step inside an ActionRepeat
+        return innermost if env_wrapper is None else env_wrapper(innermost)
 
-    env = make_evaluation_env(model, env_id, kwargs, vec_normalize, filmed)
+    env = make_evaluation_env(model, env_id, kwargs, vec_normalize, recorded)
     try:
         fps = env.get_attr("metadata")[0].get("render_fps", 30)
         evaluation = run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))
-        # The last frame is of the episode that the vectorised environment began when the last one ended.
+        # The vectorised environment resets itself after the last episode: the last frame belongs to the next one.
         frames = env.env_method("render")[0][:-1]
     except gym.error.Error as error:
-        raise UserError(f"{env_id} draws no images: {one_line(error)}") from error
+        raise UserError(f"{env_id} renders no images: {one_line(error)}") from error
     finally:
         env.close()
-    write_film(path, frames, fps)
+    write_video(path, frames, fps)
     return evaluation
 
 
-def write_film(path: str | Path, frames: list[Any], fps: float) -> None:
+def write_video(path: str | Path, frames: list[Any], fps: float) -> None:
     """
+    Write frames as a video.
+
     :param path: ``.gif`` or ``.mp4``
     :param frames: uint8 images, ``(height, width, 3)``, at least one
-    :param fps: frames a second
+    :param fps: frames per second
     """
-    path = check_film(path)
+    path = check_video(path)
     with atomic_write(path) as temporary:
         if path.suffix.lower() == ".gif":
             imageio.mimwrite(temporary, frames, duration=1000 / fps, loop=0)
         else:
-            # H.264 wants even sizes: other frames are scaled up to the next multiple of 2.
+            # H.264 needs even sizes: other frames are scaled up to the next multiple of 2.
             imageio.mimwrite(temporary, frames, fps=fps, macro_block_size=2)

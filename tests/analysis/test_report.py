@@ -137,9 +137,9 @@ def test_the_page_shows_what_failed(page):
 
 def test_the_page_shows_the_best_models(page):
     shown = {image["alt"]: page.picture(i) for i, image in enumerate(page.images) if image["alt"].startswith(ENV)}
-    film = f"{ENV}, sac_por, seed 0: best of its evaluations 0.900"
-    assert len(shown) == 3 and {film, f"{ENV}, sac, seed 0: best of its evaluations 0.600"} < set(shown)
-    kind, moving = shown[film]
+    video = f"{ENV}, sac_por, seed 0: best of its evaluations 0.900"
+    assert len(shown) == 3 and {video, f"{ENV}, sac, seed 0: best of its evaluations 0.600"} < set(shown)
+    kind, moving = shown[video]
     assert kind == "data:image/gif" and moving.n_frames > 1
     (saliency,) = [picture for alt, picture in shown.items() if "what its classifier looks at" in alt]
     assert saliency[0] == "data:image/png"

@@ -1,4 +1,4 @@
-"""Evaluation plays the same held-out episodes for every model; models load from any sound file; films show the episodes."""
+"""Evaluation plays the same held-out episodes for every model; models load from any sound file; videos show the episodes."""
 
 import json
 import zipfile
@@ -20,7 +20,7 @@ from sb3_por.evaluation.episodes import Episode, Evaluation, FixedEpisodes, eval
 from sb3_por.evaluation.evaluate import evaluate
 from sb3_por.evaluation.loading import load_model, trained_in
 from sb3_por.evaluation.reference_policies import ExpertModel, RandomModel
-from sb3_por.evaluation.video import film, write_film
+from sb3_por.evaluation.video import record_video, write_video
 from softbody_envs.wrappers import ActionRepeat
 
 EPISODE_STEPS = 7
@@ -138,8 +138,8 @@ def test_a_run_is_evaluated_inside_the_wrappers_that_it_was_trained_in(tmp_path)
     environment = trained_in(tmp_path, "FallingBall-v0")
     evaluation = evaluate(model, "FallingBall-v0", n_episodes=1, **environment)
     assert evaluation.returns[0] > -1e4  # the environment's own rewards, as in training
-    filmed = film(model, "FallingBall-v0", tmp_path / "film.gif", size=32, **environment)
-    assert filmed.returns == evaluation.returns
+    recorded = record_video(model, "FallingBall-v0", tmp_path / "video.gif", size=32, **environment)
+    assert recorded.returns == evaluation.returns
     with pytest.raises(UserError, match="was not trained on FallingBall-v0"):
         evaluate(model, "FallingBall-v0", n_episodes=1)
     (tmp_path / "FallingBall-v0" / "config.yml").write_text("env_wrapper: no_such_package.Wrapper\n")
@@ -232,9 +232,9 @@ def test_a_named_algorithm_must_be_known_and_must_be_the_models(pendulum_zip):
 
 
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
-def test_a_film_has_a_frame_for_the_reset_and_each_step(suffix, tmp_path):
-    path = tmp_path / f"film.{suffix}"
-    evaluation = film(ExpertModel("PourWater-v0"), "PourWater-v0", path, size=64)
+def test_a_video_has_a_frame_for_the_reset_and_each_step(suffix, tmp_path):
+    path = tmp_path / f"video.{suffix}"
+    evaluation = record_video(ExpertModel("PourWater-v0"), "PourWater-v0", path, size=64)
     frames = imageio.mimread(path, memtest=False)
     # A GIF joins frames that are alike, such as those of water at rest.
     assert 20 < len(frames) <= 101 and frames[0].shape[:2] == (64, 64)
@@ -242,20 +242,20 @@ def test_a_film_has_a_frame_for_the_reset_and_each_step(suffix, tmp_path):
     assert not np.array_equal(frames[0][..., :3], frames[-1][..., :3])
 
 
-def test_a_film_shows_the_steps_that_a_wrapper_makes_of_one(tmp_path):
-    path = tmp_path / "film.mp4"
-    filmed = film(
+def test_a_video_shows_the_steps_that_a_wrapper_makes_of_one(tmp_path):
+    path = tmp_path / "video.mp4"
+    recorded = record_video(
         ExpertModel("PourWater-v0"), "PourWater-v0", path, size=64, env_wrapper=lambda env: ActionRepeat(env, repeat=10)
     )
-    assert len(imageio.mimread(path, memtest=False)) == 101 and filmed.lengths == [100]
+    assert len(imageio.mimread(path, memtest=False)) == 101 and recorded.lengths == [100]
 
 
-def test_films_of_odd_size_and_unknown_format(tmp_path):
+def test_videos_of_odd_size_and_unknown_format(tmp_path):
     frames = [np.full((31, 33, 3), value, dtype=np.uint8) for value in (0, 250)]
-    write_film(tmp_path / "odd.mp4", frames, fps=5)
+    write_video(tmp_path / "odd.mp4", frames, fps=5)
     assert len(imageio.mimread(tmp_path / "odd.mp4")) == 2
     with pytest.raises(UserError, match=r"must end in \.gif or \.mp4"):
-        write_film(tmp_path / "film.avi", frames, fps=5)
+        write_video(tmp_path / "video.avi", frames, fps=5)
     assert [path.name for path in tmp_path.iterdir()] == ["odd.mp4"]
 
 

@@ -63,7 +63,7 @@ def test_evaluate_knows_the_two_ends_of_the_scale(capsys):
     assert "success 0%" in random and "success 100%" in expert
 
 
-def test_enjoy_writes_a_film_and_says_where(run, tmp_path, capsys):
+def test_enjoy_writes_a_video_and_says_where(run, tmp_path, capsys):
     path = tmp_path / "new" / "expert.gif"
     arguments = ["--model", "expert", "--env", "PourWater-v0", "-o", str(path), "--size", "48"]
     assert main(["enjoy", *arguments]) == 0
@@ -73,15 +73,15 @@ def test_enjoy_writes_a_film_and_says_where(run, tmp_path, capsys):
 
 def test_enjoy_says_what_an_environment_needs_to_draw(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    assert main(["enjoy", "--model", str(run), "--env", "Pendulum-v1", "-o", str(tmp_path / "film.gif")]) == 2
-    assert "error: Pendulum-v1 draws no images: pygame is not installed" in capsys.readouterr().err
+    assert main(["enjoy", "--model", str(run), "--env", "Pendulum-v1", "-o", str(tmp_path / "video.gif")]) == 2
+    assert "error: Pendulum-v1 renders no images: pygame is not installed" in capsys.readouterr().err
 
 
 def test_report_writes_a_page_and_says_where(run, tmp_path, capsys):
-    assert main(["report", str(run), "-o", str(tmp_path / "page"), "--no-films"]) == 0
+    assert main(["report", str(run), "-o", str(tmp_path / "page"), "--no-videos"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'page' / 'index.html'}\n"
     page = (tmp_path / "page" / "index.html").read_text()
-    assert "Pendulum-v1" in page and 'id="films"' not in page and "not everything can be shown of its model" not in page
+    assert "Pendulum-v1" in page and 'id="videos"' not in page and "not everything can be shown of its model" not in page
 
 
 def test_plot_draws_a_run_and_its_table_draws_the_same(run, tmp_path, capsys):
@@ -129,9 +129,9 @@ def test_plot_draws_every_figure_into_a_folder(run, tmp_path, capsys):
         (["evaluate", "--model", "nothing", "--env", "CartPole-v1"], "no middle of its actions"),
         (["evaluate", "--model", "RUN", "--env", "no_such_package:E-v0"], "cannot import the package no_such_package"),
         (["evaluate", "--model", "RUN", "--env", "Pendulum-v1", "--seed", "-5"], "--seed must not be negative"),
-        (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "film.gif", "--size", "0"], "at least 1 pixel"),
-        (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "film.avi"], "must end in .gif or .mp4"),
-        (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "/proc/film.gif"], "cannot write in /proc"),
+        (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "video.gif", "--size", "0"], "at least 1 pixel"),
+        (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "video.avi"], "must end in .gif or .mp4"),
+        (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "/proc/video.gif"], "cannot write in /proc"),
         (["plot", "nowhere", "-o", "curve.png"], "there is no folder nowhere"),
         (["report", "nowhere", "-o", "page"], "there is no folder nowhere"),
         (["report", "none.csv", "-o", "page"], "cannot read none.csv"),

@@ -111,7 +111,7 @@ def _plot_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _plot(args: argparse.Namespace) -> None:
     from sb3_por.analysis import figures
-    from sb3_por.analysis.por_logs import find_order, read_order, write_order
+    from sb3_por.analysis.por_logs import read_order, write_order
     from sb3_por.analysis.scores import read_scores, write_csv
     from sb3_por.common.files import check_output, check_writable
 
@@ -124,23 +124,30 @@ def _plot(args: argparse.Namespace) -> None:
     if args.kind == figures.ORDER:
         if args.step is not None:
             raise UserError(f"--step is where scores are compared; --kind {figures.ORDER} shows all of training")
-        order = read_order(args.paths)
+        order, left_out = read_order(args.paths)
+        _print_notes(left_out)
         plot, notes = figures.plot_order(order)
         plot.save(args.output)
     else:
         scores = read_scores(args.paths)
         how = {"metric": args.metric, "step": args.step, "seed": args.seed}
         if args.kind == "all":
-            plots, notes = figures.plot_all(scores, find_order(args.paths), **how)
+            order, left_out = read_order(path for path in args.paths if not path.endswith(".csv"))
+            plots, notes = figures.plot_all(scores, order, **how)
+            notes = [*left_out, *notes]
             figures.save_all(plots, args.output)
         else:
             plot, notes = figures.plot(scores, args.kind, **how)
             plot.save(args.output)
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+    _print_notes(notes)
     if args.csv:
         write_order(order, args.csv) if args.kind == figures.ORDER else write_csv(scores, args.csv)
     print(args.output)
+
+
+def _print_notes(notes: list[str]) -> None:
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
 
 
 def _diagnose_arguments(parser: argparse.ArgumentParser) -> None:

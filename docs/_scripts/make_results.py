@@ -241,7 +241,7 @@ def draw() -> None:
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     for suite in ("main", "full_speed"):
-        plot_order(read_order([RESULTS / suite / "order.csv"]))[0].save(RESULTS / suite / "order.png")
+        plot_order(read_order([RESULTS / suite / "order.csv"])[0])[0].save(RESULTS / suite / "order.png")
 
 
 def main() -> None:

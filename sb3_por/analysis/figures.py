@@ -1,4 +1,4 @@
-"""Which figures there are, the table behind each, and how both become files."""
+"""All figures, the table behind each, and how both are saved."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from sb3_por.analysis.plot_style import FORMATS, save_figure
 from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write, check_output, check_writable
 
-#: What a figure can be saved as; ``.csv`` has its numbers.
+#: Formats of a figure; ``.csv`` holds its numbers.
 SUFFIXES = (*FORMATS, ".csv")
 
 
 @dataclass(frozen=True)
 class Kind:
     """
-    A figure of scores.
+    A kind of figure.
 
-    :param title: what it answers
-    :param measure: grid, bootstrap samples, seed -> its table
+    :param title: the question that it answers
+    :param measure: grid, number of bootstrap samples, seed -> the table
     :param draw: table, metric -> the figure
     """
 
@@ -40,7 +40,7 @@ KINDS = {
     "improvement": Kind("How likely is one better than another?", statistics.improvements, plots.draw_improvements),
     "ratio": Kind("How far ahead of its best rival is each?", statistics.ratios, plots.draw_ratios),
 }
-#: The figure of the order objective, which is drawn from another table.
+#: The figure of POR's classifier, drawn from the order table instead of the scores.
 ORDER = "order"
 ORDER_TITLE = "What does the partial-order classifier learn?"
 
@@ -50,8 +50,8 @@ class Plot:
     """
     A figure and its numbers.
 
-    :param name: of ``KINDS``, or ``ORDER``
-    :param title: what it answers
+    :param name: one of ``KINDS``, or ``ORDER``
+    :param title: the question that it answers
     :param table: its numbers
     :param figure: the figure
     """
@@ -63,7 +63,9 @@ class Plot:
 
     def save(self, path: str | Path) -> None:
         """
-        :param path: ends in one of ``SUFFIXES``
+        Save the figure, or its numbers.
+
+        :param path: its suffix, one of ``SUFFIXES``, decides the format
         """
         path = check_output(path, SUFFIXES)
         if path.suffix.lower() != ".csv":
@@ -81,13 +83,15 @@ def plot(
     seed: int = 0,
 ) -> tuple[Plot, list[str]]:
     """
+    Draw one figure of scores.
+
     :param scores: a table of scores
     :param kind: one of ``KINDS``
     :param metric: one of ``METRICS``
     :param step: see :func:`sb3_por.analysis.learning_curves.read_grid`
-    :param reps: bootstrap samples
-    :param seed: of the bootstrap
-    :return: the figure, and what was left out, one sentence each
+    :param reps: number of bootstrap samples
+    :param seed: seed of the bootstrap
+    :return: the figure, and a sentence on everything left out
     :raises UserError: if there is nothing to draw
     """
     grid = read_grid(scores, metric, step)
@@ -98,37 +102,44 @@ def plot(
 
 
 def _plot(grid: Grid, kind: str, reps: int, seed: int) -> Plot | None:
-    """``None`` if there is nothing to draw, which the grid's notes explain."""
+    """One figure; ``None`` if there is nothing to draw, which the grid's notes explain."""
     table = KINDS[kind].measure(grid, reps, seed)
     return None if table.empty else Plot(kind, KINDS[kind].title, table, KINDS[kind].draw(table, grid.metric))
 
 
 def plot_order(order: pd.DataFrame) -> tuple[Plot, list[str]]:
     """
-    :param order: of :func:`sb3_por.analysis.por_logs.read_order`
-    :return: the figure, and what was left out
+    Draw the figure of POR's classifier.
+
+    :param order: an order table, see :func:`sb3_por.analysis.por_logs.read_order`
+    :return: the figure, and a sentence on everything left out
+    :raises UserError: if the table is empty
     """
+    if order.empty:
+        raise UserError("no run has logged a POR loss; give run folders of sac_por or tqc_por, with their TensorBoard files")
     table, notes = statistics.order_curves(order)
     return Plot(ORDER, ORDER_TITLE, table, plots.draw_order(table)), notes
 
 
 def plot_all(
     scores: pd.DataFrame,
-    order: pd.DataFrame | None = None,
+    order: pd.DataFrame,
     metric: str = "normalized_performance",
     step: int | None = None,
     reps: int = statistics.REPS,
     seed: int = 0,
 ) -> tuple[list[Plot], list[str]]:
     """
+    Draw every figure that can be drawn.
+
     :param scores: a table of scores
-    :param order: of :func:`sb3_por.analysis.por_logs.read_order`, if there is one
+    :param order: an order table, see :func:`sb3_por.analysis.por_logs.read_order`; may be empty
     :param metric: one of ``METRICS``
     :param step: see :func:`sb3_por.analysis.learning_curves.read_grid`
-    :param reps: bootstrap samples
-    :param seed: of the bootstrap
-    :return: every figure that can be drawn, and what was left out
-    :raises UserError: if nothing of the metric is recorded, or no run reaches the step
+    :param reps: number of bootstrap samples
+    :param seed: seed of the bootstrap
+    :return: the figures, and a sentence on everything left out
+    :raises UserError: if the metric was never recorded, or no run covers the step
     """
     grid = read_grid(scores, metric, step)
     drawn = []
@@ -137,19 +148,16 @@ def plot_all(
             drawn.append(_plot(grid, kind, reps, seed))
         except UserError as error:
             grid.note(f"no figure {kind}: {error}")
-    notes = grid.notes
-    if order is not None:
-        try:
-            figure, left_out = plot_order(order)
-            drawn.append(figure)
-            notes = [*notes, *left_out]
-        except UserError as error:
-            notes = [*notes, f"no figure {ORDER}: {error}"]
-    return [one for one in drawn if one is not None], notes
+    try:
+        figure, notes = plot_order(order)
+        drawn.append(figure)
+    except UserError as error:
+        notes = [f"no figure {ORDER}: {error}"]
+    return [one for one in drawn if one is not None], [*grid.notes, *notes]
 
 
 def save_all(plots: list[Plot], folder: str | Path) -> None:
-    """Write every figure as PNG, PDF and table (``.csv``) under its name."""
+    """Save every figure as PNG, PDF and table (``.csv``) under its name."""
     check_writable(folder)
     for one in plots:
         for suffix in (".png", ".pdf", ".csv"):

@@ -1,4 +1,4 @@
-"""Runs laid side by side: what of a table of scores can be compared, and a word on everything that cannot."""
+"""Learning curves aligned for comparison, with a note on each run left out."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -10,21 +10,24 @@ import pandas as pd
 from sb3_por.analysis.scores import RUN_KEYS
 from sb3_por.common.errors import UserError
 
-#: Algorithms that see the state: a ceiling for those that see images, not a rival of theirs.
+#: Algorithms that observe the state. They bound what algorithms on images can reach, and are no rivals of theirs.
 STATE_ALGOS = ("sac",)
 
 
-def in_order(algos: Iterable[str]) -> list[str]:
-    """POR first, then its rivals, then what sees the state: the order of tables, figures, and sides of a comparison."""
+def sort_algos(algos: Iterable[str]) -> list[str]:
+    """Sort algorithms for tables, figures and comparisons: POR first, then its rivals, then those that observe the state."""
     return sorted(set(algos), key=lambda algo: (algo in STATE_ALGOS, "por" not in algo, algo))
 
 
-class Run(NamedTuple):
+class LearningCurve(NamedTuple):
     """
     The scores of one run.
 
-    :param steps: of the evaluations that have a score, rising
-    :param scores: same shape
+    :param env: environment id
+    :param algo: name of the algorithm, or the run's label
+    :param seed: seed
+    :param steps: environment steps of the evaluations with a score, rising
+    :param scores: the scores, same shape
     """
 
     env: str
@@ -40,59 +43,63 @@ class Run(NamedTuple):
 @dataclass
 class Grid:
     """
-    Runs of algorithms, environments and seeds; cells may be empty, and runs differ in length.
+    A grid of algorithms, environments and seeds with a learning curve in each cell. Cells may be empty, and curves may
+    differ in length.
 
-    :param metric: what the scores are
-    :param runs: at least one, in order of environment, algorithm and seed
-    :param notes: what was left out so far, one sentence each; the methods add to it
+    :param metric: name of the score
+    :param curves: at least one, sorted by environment, algorithm and seed
+    :param notes: a sentence on everything left out so far; the methods add to it
     """
 
     metric: str
-    runs: list[Run]
+    curves: list[LearningCurve]
     notes: list[str] = field(default_factory=list)
 
     @property
     def algos(self) -> list[str]:
-        return in_order(run.algo for run in self.runs)
+        return sort_algos(curve.algo for curve in self.curves)
 
     @property
     def envs(self) -> list[str]:
-        return sorted({run.env for run in self.runs})
+        return sorted({curve.env for curve in self.curves})
 
-    def of(self, algo: str | None = None, env: str | None = None) -> list[Run]:
-        """The runs of an algorithm, an environment, or both."""
-        return [run for run in self.runs if algo in (None, run.algo) and env in (None, run.env)]
+    def of(self, algo: str | None = None, env: str | None = None) -> list[LearningCurve]:
+        """The curves of an algorithm, an environment, or both."""
+        return [curve for curve in self.curves if algo in (None, curve.algo) and env in (None, curve.env)]
 
     def note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
 
-    def table(self, runs: list[Run], what: str) -> tuple[np.ndarray, np.ndarray]:
+    def table(self, curves: list[LearningCurve], what: str) -> tuple[np.ndarray, np.ndarray]:
         """
-        :param runs: some of the grid's
-        :param what: what they are, for the notes
-        :return: every step at which one of the runs was evaluated, as far as all of them go, and the scores of the runs
-            there, ``(runs, steps)``, interpolated where a run was not evaluated
-        :raises UserError: if the runs have no step in common
+        Align curves at every step at which one of them has an evaluation, within the range that all of them cover.
+
+        :param curves: some of the grid's
+        :param what: name of this selection, for the notes
+        :return: the steps, and the scores there, ``(curves, steps)``, interpolated between evaluations
+        :raises UserError: if the curves have no step in common
         """
-        first, last = self._span(runs, what)
-        steps = np.unique(np.concatenate([run.steps for run in runs]))
+        first, last = self._span(curves, what)
+        steps = np.unique(np.concatenate([curve.steps for curve in curves]))
         steps = steps[(steps >= first) & (steps <= last)]
-        return steps, np.array([np.interp(steps, run.steps, run.scores) for run in runs])
+        return steps, np.array([np.interp(steps, curve.steps, curve.scores) for curve in curves])
 
     def matrix(self, algo: str) -> tuple[np.ndarray, np.ndarray]:
         """
-        :return: steps as :meth:`table`, and the algorithm's scores there, ``(seeds, environments, steps)``: as many seeds
-            as the environment with the fewest has
+        Align all curves of an algorithm, with the same number of seeds on each environment: the smallest.
+
+        :return: steps as in :meth:`table`, and the scores there, ``(seeds, environments, steps)``
         """
-        by_env = self._same_number(algo, sorted({run.env for run in self.of(algo)}))
-        steps, rows = self.table([run for runs in by_env for run in runs], algo)
+        by_env = self._same_number(algo, sorted({curve.env for curve in self.of(algo)}))
+        steps, rows = self.table([curve for curves in by_env for curve in curves], algo)
         return steps, rows.reshape(len(by_env), -1, len(steps)).swapaxes(0, 1)
 
     def last(self) -> tuple[int, dict[str, np.ndarray]]:
         """
-        :return: the last step that every run has reached, and for each algorithm its scores there, ``(seeds,
-            environments)``, over the environments that every algorithm was run on
+        Compare at the last step that every curve reaches, over the environments that every algorithm was run on.
+
+        :return: the step, and each algorithm's scores there, ``(seeds, environments)``
         :raises UserError: if there is no such environment, or no such step
         """
         envs = [env for env in self.envs if all(self.of(algo, env) for algo in self.algos)]
@@ -101,41 +108,44 @@ class Grid:
         for env in set(self.envs) - set(envs):
             missing = [algo for algo in self.algos if not self.of(algo, env)]
             self.note(f"{env} was not run with {' and '.join(missing)}, so comparisons of all algorithms leave it out")
-        compared = [run for run in self.runs if run.env in envs]
+        compared = [curve for curve in self.curves if curve.env in envs]
         step = self._span(compared, "the comparison")[1]
         matrices = {}
         for algo in self.algos:
             by_env = self._same_number(algo, envs)
-            matrices[algo] = np.array([[np.interp(step, run.steps, run.scores) for run in runs] for runs in by_env]).T
+            ends = [[np.interp(step, curve.steps, curve.scores) for curve in curves] for curves in by_env]
+            matrices[algo] = np.array(ends).T
         return step, matrices
 
-    def _span(self, runs: list[Run], what: str) -> tuple[int, int]:
-        """The first and the last step that all of some runs have; a note if one is shorter than others."""
-        latest, shortest = max(runs, key=lambda run: run.steps[0]), min(runs, key=lambda run: run.steps[-1])
+    def _span(self, curves: list[LearningCurve], what: str) -> tuple[int, int]:
+        """First and last step that all curves cover; notes if one is shorter than the others."""
+        latest, shortest = max(curves, key=lambda curve: curve.steps[0]), min(curves, key=lambda curve: curve.steps[-1])
         first, last = int(latest.steps[0]), int(shortest.steps[-1])
         if first > last:
             raise UserError(f"{what}: the runs have no step in common: {latest} begins at {first}, {shortest} ends at {last}")
-        if last < max(run.steps[-1] for run in runs):
+        if last < max(curve.steps[-1] for curve in curves):
             self.note(f"{what}: the runs differ in length, so it ends with the shortest at step {last} ({shortest})")
         return first, last
 
-    def _same_number(self, algo: str, envs: Iterable[str]) -> list[list[Run]]:
-        """The algorithm's runs on each environment, the same number everywhere: the first seeds."""
+    def _same_number(self, algo: str, envs: Iterable[str]) -> list[list[LearningCurve]]:
+        """The algorithm's curves on each environment, the same number everywhere: the first seeds."""
         by_env = {env: self.of(algo, env) for env in envs}
-        n_runs = min(map(len, by_env.values()))
-        for env, runs in by_env.items():
-            if len(runs) > n_runs:
-                self.note(f"{algo}: {len(runs)} seeds on {env} but {n_runs} elsewhere, so the first {n_runs} are used")
-        return [runs[:n_runs] for runs in by_env.values()]
+        n_seeds = min(map(len, by_env.values()))
+        for env, curves in by_env.items():
+            if len(curves) > n_seeds:
+                self.note(f"{algo}: {len(curves)} seeds on {env} but {n_seeds} elsewhere, so the first {n_seeds} are used")
+        return [curves[:n_seeds] for curves in by_env.values()]
 
 
 def read_grid(scores: pd.DataFrame, metric: str = "normalized_performance", step: int | None = None) -> Grid:
     """
+    Arrange a table of scores as a grid. Scores that are NaN or infinite are left out, with a note.
+
     :param scores: a table with the columns env, algo, seed, step, and the metric
     :param metric: name of a column
-    :param step: cut the runs off here, and leave out those that end before or begin after; ``None``: as long as they are
-    :return: its runs; scores that are NaN or infinite are left out, which is noted
-    :raises UserError: if nothing of the metric is recorded, or no run reaches the step
+    :param step: cut the curves off at this step and leave out those that do not cover it; ``None`` keeps all
+    :return: the grid
+    :raises UserError: if the metric was never recorded, or no curve covers the step
     """
     finite = np.isfinite(scores[metric].astype(float))
     if not finite.any():
@@ -147,20 +157,20 @@ def read_grid(scores: pd.DataFrame, metric: str = "normalized_performance", step
         grid.note(f"{(~finite).sum()} of {len(scores)} evaluations have no {metric} and are left out")
     for (env, algo, seed), rows in scores.assign(finite=finite).groupby(RUN_KEYS, sort=True):
         sound = rows[rows["finite"]].sort_values("step")
-        run = Run(env, algo, int(seed), sound["step"].to_numpy(), sound[metric].to_numpy(float))
+        curve = LearningCurve(env, algo, int(seed), sound["step"].to_numpy(), sound[metric].to_numpy(float))
         if not len(sound):
-            grid.note(f"{run}: no {metric} at all, so the run is left out")
-        elif step is not None and not run.steps[0] <= step <= run.steps[-1]:
-            grid.note(f"{run}: evaluated from step {run.steps[0]} to {run.steps[-1]}, not at {step}, so it is left out")
+            grid.note(f"{curve}: no {metric} at all, so the run is left out")
+        elif step is not None and not curve.steps[0] <= step <= curve.steps[-1]:
+            grid.note(f"{curve}: evaluated from step {curve.steps[0]} to {curve.steps[-1]}, not at {step}, so it is left out")
         else:
-            grid.runs.append(run if step is None else _cut(run, step))
-    if not grid.runs:
+            grid.curves.append(curve if step is None else _cut(curve, step))
+    if not grid.curves:
         raise UserError(f"no run was evaluated at step {step}; the last evaluation is at step {scores['step'].max()}")
     return grid
 
 
-def _cut(run: Run, step: int) -> Run:
-    """A run up to a step, with its score there, interpolated if it was not evaluated."""
-    before = run.steps < step
-    last = np.interp(step, run.steps, run.scores)
-    return run._replace(steps=np.append(run.steps[before], step), scores=np.append(run.scores[before], last))
+def _cut(curve: LearningCurve, step: int) -> LearningCurve:
+    """A curve up to a step, interpolated there if the run was not evaluated at that step."""
+    before = curve.steps < step
+    last = np.interp(step, curve.steps, curve.scores)
+    return curve._replace(steps=np.append(curve.steps[before], step), scores=np.append(curve.scores[before], last))

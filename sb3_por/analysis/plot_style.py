@@ -1,5 +1,6 @@
-"""What all figures share: colours of the algorithms, curves, intervals, panels, legends, and files."""
+"""Shared parts of all figures: looks of algorithms, curves, intervals, panels, legends, and files."""
 
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,25 +13,35 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from sb3_por import ALGORITHMS
 from sb3_por.common.files import atomic_write, check_output
 
-#: Okabe and Ito's colours, told apart by readers with any colour vision (brown for their yellow, which is faint on white);
-#: line styles and markers for print in grey.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#E69F00", "#8C510A")
+#: Colours of the algorithms that the documentation compares. A look depends on the name alone, so that an algorithm looks
+#: the same in every figure, whoever stands beside it. These are Okabe and Ito's colours, which readers with any colour
+#: vision can tell apart (brown stands for their yellow, which is faint on white).
+COLORS = {
+    "sac_por": "#0072B2",
+    "sac_drq": "#D55E00",
+    "sac_curl": "#009E73",
+    "sac_spr": "#CC79A7",
+    "tqc_por": "#56B4E9",
+    "sac": "#000000",
+    "por_lambda_0": "#E69F00",
+    "por_paper": "#8C510A",
+}
+#: Colours of all other names: Tol's "muted" scheme, without those close to one above.
+OTHER_COLORS = ("#332288", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499")
+#: Line styles and markers keep curves apart in grey print.
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), (0, (8, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "p", "h", "X")
 FORMATS = (".png", ".pdf", ".svg")
-#: An algorithm looks the same in every figure, whoever stands beside it: these have the first looks, others the next.
-KNOWN = [*ALGORITHMS, "sac"]
-#: Markers on a curve, about.
+#: Approximate number of markers on a curve.
 N_MARKERS = 12
-#: Widest row of panels.
+#: Most panels in a row.
 MAX_COLUMNS = 3
 
 
 class Look(NamedTuple):
-    """How an algorithm is drawn."""
+    """Colour, line style and marker of an algorithm."""
 
     color: str
     style: Any
@@ -38,15 +49,30 @@ class Look(NamedTuple):
 
 
 def looks(algos: Iterable[str]) -> dict[str, Look]:
-    """The look of each algorithm; 64 are told apart."""
-    names = list(dict.fromkeys([*KNOWN, *sorted(algos)]))
-    n = len(COLORS)
-    return {name: Look(COLORS[i % n], STYLES[(i + i // n) % n], MARKERS[(i + i // n) % n]) for i, name in enumerate(names)}
+    """
+    Look up how to draw algorithms.
+
+    :param algos: names of algorithms or labels
+    :return: name -> look. Names in ``COLORS`` have fixed looks. Of other names 64 are told apart: a hash of the name chooses
+        the look; where two names of one figure choose the same, the later in the alphabet takes the next free one.
+    """
+    names = set(algos)
+    known = [name for name in COLORS if name in names]
+    found = {name: Look(COLORS[name], STYLES[i], MARKERS[i]) for i, name in enumerate(COLORS) if name in known}
+    n = len(OTHER_COLORS) * len(STYLES)
+    taken: set[int] = set()
+    for name in sorted(names - set(known)):
+        first = zlib.crc32(name.encode())
+        i = next((j % n for j in range(first, first + n) if j % n not in taken), first % n)
+        taken.add(i)
+        color, line = i % len(OTHER_COLORS), i // len(OTHER_COLORS)
+        found[name] = Look(OTHER_COLORS[color], STYLES[line], MARKERS[line])
+    return found
 
 
 @contextmanager
 def style() -> Iterator[None]:
-    """A context in which figures are made."""
+    """Matplotlib settings shared by all figures, as a context."""
     settings = {
         "font.size": 11,
         "axes.spines.top": False,
@@ -70,51 +96,53 @@ def one_panel() -> tuple[Figure, Axes]:
 
 def panels(n: int, height: float) -> tuple[Figure, list[Axes]]:
     """
+    Make a figure with panels in rows of at most ``MAX_COLUMNS``.
+
     :param n: number of panels
-    :param height: of each, inches
-    :return: a figure with this many panels in rows of at most ``MAX_COLUMNS``
+    :param height: height of a panel, inches
+    :return: the figure and its panels
     """
     columns = n if n <= MAX_COLUMNS else int(np.ceil(n / np.ceil(n / MAX_COLUMNS)))
     rows = -(-n // columns)
     figure = Figure(figsize=(max(4 * columns, 6), height * rows + 0.6), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for empty in grid[n:]:
+    subplots = figure.subplots(rows, columns, squeeze=False).ravel()
+    for empty in subplots[n:]:
         empty.set_axis_off()
-    return figure, list(grid[:n])
+    return figure, list(subplots[:n])
 
 
 def curve(axes: Axes, x: pd.Series, y: pd.Series, low: pd.Series, high: pd.Series, look: Look, label: str) -> None:
-    """A line in its band."""
+    """Draw a line with a band from low to high."""
     strong(axes, x, y, look, label)
     axes.fill_between(x, low, high, color=look.color, alpha=0.18, linewidth=0)
 
 
 def strong(axes: Axes, x: pd.Series, y: pd.Series, look: Look, label: str) -> None:
-    """A line with markers."""
+    """Draw a line with markers."""
     every = -(-len(x) // N_MARKERS)
     axes.plot(x, y, label=label, color=look.color, linestyle=look.style, marker=look.marker, markevery=every)
 
 
 def faint(axes: Axes, x: pd.Series, y: pd.Series, look: Look, label: str) -> None:
-    """A thin line for what a curve is compared with."""
-    # The underscore keeps it out of the legend, which has the strong line of the same look.
+    """Draw a thin line: the reference that a curve is compared with."""
+    # The underscore keeps it out of the legend, where the strong line of the same look stands.
     axes.plot(x, y, label=f"_{label}", color=look.color, linestyle=look.style, alpha=0.5, linewidth=1)
 
 
 def right_title(axes: Axes, text: str) -> None:
-    """What is to be seen in a panel, in small letters above its right end."""
+    """Write a small title at the right end above a panel."""
     axes.set_title(text, loc="right", fontsize=9, color="0.3")
 
 
 def interval(axes: Axes, row: int, value: float, low: float, high: float, look: Look) -> None:
-    """A mark in its interval, on a row of its own."""
+    """Draw a value with its interval on a row."""
     axes.plot([low, high], [row, row], color=look.color, alpha=0.35, linewidth=9, solid_capstyle="butt")
     axes.plot([value], [row], color=look.color, marker=look.marker, markersize=8, markeredgecolor="white")
     axes.xaxis.set_major_locator(MaxNLocator(4))
 
 
 def name_rows(axes: Axes, names: list[str]) -> None:
-    """Names beside the rows of intervals, the first on top."""
+    """Write names beside the rows of intervals, the first on top."""
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
@@ -127,7 +155,7 @@ def steps_axis(axes: Axes) -> None:
 
 
 def legend_below(figure: Figure, axes: Iterable[Axes], title: str) -> None:
-    """One legend for all panels."""
+    """Draw one legend for all panels."""
     entries: dict[str, Any] = {}
     for panel in axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
@@ -137,10 +165,10 @@ def legend_below(figure: Figure, axes: Iterable[Axes], title: str) -> None:
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, PDF or SVG, byte for byte the same for the same figure."""
+    """Save a figure as PNG, PDF or SVG. The same figure gives the same bytes."""
     path = check_output(path, FORMATS)
     metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower())
     with atomic_write(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "sb3-por"}):
         figure.savefig(temporary, dpi=150, metadata=metadata)
-    # Panels, labels and legend have their places: to work them out again takes longer than to write the next format.
+    # The layout is final: computing it again takes longer than saving the next format.
     figure.set_layout_engine("none")

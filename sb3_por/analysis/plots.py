@@ -1,4 +1,4 @@
-"""The figures: a table of ``statistics.py`` each, drawn to be read without a caption."""
+"""Figures that can be read without a caption, each drawn from a table of ``statistics.py``."""
 
 import math
 
@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_por.analysis.learning_curves import in_order
+from sb3_por.analysis.learning_curves import sort_algos
 from sb3_por.analysis.plot_style import (
     Look,
     curve,
@@ -32,14 +32,16 @@ LABELS = {
     "por_loss": "POR loss",
     "por_accuracy": "POR accuracy",
 }
-#: What a classifier that knows nothing has, its name, and the limits of the axis.
+#: Metric -> its value at chance, the name of that value, and the limits of the axis.
 CHANCE = {"por_loss": (math.log(2), "ln 2", (0, 1.05)), "por_accuracy": (0.5, "½", (0.3, 1.02))}
 
 
 def draw_iqm(table: pd.DataFrame, metric: str) -> Figure:
     """
-    :param table: of :func:`sb3_por.analysis.statistics.iqm_curves`
-    :param metric: what the scores are, for the labels; here and below
+    Draw sample-efficiency curves over all tasks.
+
+    :param table: see :func:`sb3_por.analysis.statistics.iqm_curves`
+    :param metric: name of the score, a key of ``LABELS``; here and below
     """
     by_algo, tasks = looks(table["algo"]), table["tasks"].max()
     envs = sorted({env for names in table["envs"].unique() for env in names.split()})
@@ -60,25 +62,29 @@ def draw_iqm(table: pd.DataFrame, metric: str) -> Figure:
 
 def draw_tasks(table: pd.DataFrame, metric: str) -> Figure:
     """
-    :param table: of :func:`sb3_por.analysis.statistics.task_curves`
+    Draw learning curves, a panel for each task.
+
+    :param table: see :func:`sb3_por.analysis.statistics.task_curves`
     """
     by_algo, envs = looks(table["algo"]), sorted(table["env"].unique())
     with style():
-        figure, grid = panels(len(envs), height=3.2)
-        for axes, env in zip(grid, envs, strict=True):
+        figure, subplots = panels(len(envs), height=3.2)
+        for axes, env in zip(subplots, envs, strict=True):
             for algo, rows in _algos(table[table["env"] == env]):
                 low, high = rows["mean"] - rows["std"], rows["mean"] + rows["std"]
                 curve(axes, rows["step"], rows["mean"], low, high, by_algo[algo], algo)
             axes.set_title(env)
             axes.set_ylabel(LABELS[metric])
             steps_axis(axes)
-        legend_below(figure, grid, _spread(table))
+        legend_below(figure, subplots, _spread(table))
     return figure
 
 
 def draw_profiles(table: pd.DataFrame, metric: str) -> Figure:
     """
-    :param table: of :func:`sb3_por.analysis.statistics.performance_profiles`
+    Draw performance profiles.
+
+    :param table: see :func:`sb3_por.analysis.statistics.performance_profiles`
     """
     by_algo = looks(table["algo"])
     with style():
@@ -98,7 +104,9 @@ def draw_profiles(table: pd.DataFrame, metric: str) -> Figure:
 
 def draw_aggregates(table: pd.DataFrame, metric: str) -> Figure:
     """
-    :param table: of :func:`sb3_por.analysis.statistics.aggregates`
+    Draw aggregate scores with intervals, a panel for each statistic.
+
+    :param table: see :func:`sb3_por.analysis.statistics.aggregates`
     """
     by_algo, names = looks(table["algo"]), list(dict.fromkeys(table["statistic"]))
     with style():
@@ -117,7 +125,9 @@ def draw_aggregates(table: pd.DataFrame, metric: str) -> Figure:
 
 def draw_improvements(table: pd.DataFrame, metric: str) -> Figure:
     """
-    :param table: of :func:`sb3_por.analysis.statistics.improvements`
+    Draw probabilities of improvement with intervals.
+
+    :param table: see :func:`sb3_por.analysis.statistics.improvements`
     """
     by_algo = looks(table["algo"])
     with style():
@@ -130,18 +140,20 @@ def draw_improvements(table: pd.DataFrame, metric: str) -> Figure:
         axes.set_xlim(-0.03, 1.03)
         axes.set_xticks([0, 0.25, 0.5, 0.75, 1])
         axes.set_title(f"probability of improvement at step {_step(table)}\n{_interval_of(table)}")
-        axes.set_xlabel(f"how likely a run of the first has the higher {LABELS[metric]}")
+        axes.set_xlabel(f"probability that a run of the first has the higher {LABELS[metric]}")
     return figure
 
 
 def draw_ratios(table: pd.DataFrame, metric: str) -> Figure:
     """
-    :param table: of :func:`sb3_por.analysis.statistics.ratios`
+    Draw ratios to the best rival with intervals, a panel for each task.
+
+    :param table: see :func:`sb3_por.analysis.statistics.ratios`
     """
     by_algo, envs = looks(table["algo"]), sorted(table["env"].unique())
     with style():
-        figure, grid = panels(len(envs), height=0.4 * table.groupby("env").size().max() + 1.3)
-        for axes, env in zip(grid, envs, strict=True):
+        figure, subplots = panels(len(envs), height=0.4 * table.groupby("env").size().max() + 1.3)
+        for axes, env in zip(subplots, envs, strict=True):
             rows = table[table["env"] == env]
             for i, row in enumerate(rows.itertuples()):
                 if np.isfinite(row.ratio):
@@ -157,18 +169,20 @@ def draw_ratios(table: pd.DataFrame, metric: str) -> Figure:
 
 def draw_order(table: pd.DataFrame) -> Figure:
     """
-    :param table: of :func:`sb3_por.analysis.statistics.order_curves`
+    Draw loss and accuracy of POR's classifier and the gradient norms, a column for each task.
+
+    :param table: see :func:`sb3_por.analysis.statistics.order_curves`
     """
     by_algo, envs = looks(table["algo"]), sorted(table["env"].unique())
     n_rows = len(CHANCE) + table["metric"].isin(GRADIENT_METRICS).any()
     with style():
         figure = Figure(figsize=(max(4 * len(envs), 6), 3.2 * n_rows), layout="constrained")
-        grid = figure.subplots(n_rows, len(envs), sharex="col", squeeze=False)
+        subplots = figure.subplots(n_rows, len(envs), sharex="col", squeeze=False)
         for j, env in enumerate(envs):
             here = table[table["env"] == env]
             if n_rows > len(CHANCE):
-                _gradients(grid[-1, j], here, by_algo)
-            for axes, (metric, (chance, name, limits)) in zip(grid[: len(CHANCE), j], CHANCE.items(), strict=True):
+                _gradients(subplots[-1, j], here, by_algo)
+            for axes, (metric, (chance, name, limits)) in zip(subplots[: len(CHANCE), j], CHANCE.items(), strict=True):
                 for algo, rows in _algos(here[here["metric"] == metric]):
                     low, high = rows["mean"] - rows["std"], rows["mean"] + rows["std"]
                     curve(axes, rows["step"], rows["mean"], low, high, by_algo[algo], algo)
@@ -179,28 +193,28 @@ def draw_order(table: pd.DataFrame) -> Figure:
                 axes.text(1, chance, name, transform=axes.get_yaxis_transform(), va="bottom", ha="right", color="0.3")
                 axes.set_ylabel(LABELS[metric])
                 axes.set_ylim(limits[0], max(limits[1], axes.dataLim.y1 + 0.02))
-            grid[0, j].set_title(env)
-            steps_axis(grid[-1, j])
-        legend_below(figure, grid.ravel(), _spread(table))
+            subplots[0, j].set_title(env)
+            steps_axis(subplots[-1, j])
+        legend_below(figure, subplots.ravel(), _spread(table))
     return figure
 
 
 def _gradients(axes: Axes, table: pd.DataFrame, by_algo: dict[str, Look]) -> None:
-    """How hard each loss pulls at the encoder: means over seeds."""
+    """Draw the gradient norms with respect to the encoder, means over seeds."""
     for metric, draw in zip(GRADIENT_METRICS, (faint, strong), strict=True):
         for algo, rows in _algos(table[table["metric"] == metric]):
             draw(axes, rows["step"], rows["mean"], by_algo[algo], algo)
     right_title(axes, "λ POR; faint: the critic")
     axes.set_yscale("log", nonpositive="mask")
-    axes.set_ylabel("gradient norm at the encoder")
+    axes.set_ylabel("gradient norm, encoder")
 
 
 def _algos(table: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    return [(algo, table[table["algo"] == algo]) for algo in in_order(table["algo"])]
+    return [(algo, table[table["algo"] == algo]) for algo in sort_algos(table["algo"])]
 
 
 def _count(column: pd.Series, noun: str) -> str:
-    """``3 seeds``; ``3-5 seeds`` where it is not the same everywhere."""
+    """``3 seeds``; ``3-5 seeds`` where the number varies."""
     low, high = column.min(), column.max()
     return f"{low}{f'-{high}' if high > low else ''} {noun}{'s' if high > 1 else ''}"
 
@@ -210,7 +224,7 @@ def _single(table: pd.DataFrame) -> bool:
 
 
 def _interval_of(table: pd.DataFrame) -> str:
-    # The bootstrap draws runs within each task: one run a task leaves nothing to draw.
+    # The bootstrap resamples runs within each task, so one run per task has no interval.
     return "one seed, no interval" if _single(table) else "95 % stratified bootstrap interval"
 
 
@@ -221,5 +235,5 @@ def _spread(table: pd.DataFrame) -> str:
 
 
 def _step(table: pd.DataFrame) -> str:
-    """The step of a table that has one, thousands apart."""
+    """The step of a table with a single one, with spaces between thousands."""
     return f"{table['step'].iloc[0]:,}".replace(",", " ")

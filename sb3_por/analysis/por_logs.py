@@ -1,10 +1,11 @@
-"""The table of order: what POR logs of itself during training, read from runs' TensorBoard files or from a ``.csv``."""
+"""The order table: what POR's classifier logged during training, read from TensorBoard files or from a ``.csv``."""
 
 import logging
 import math
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -12,58 +13,59 @@ from sb3_por.analysis.scores import RUN_KEYS, join_runs
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.files import atomic_write
 from sb3_por.runs.facts import run_identity
-from sb3_por.runs.folder import find_runs
+from sb3_por.runs.folder import find_runs, read_evaluations, run_arguments
 
-#: Chance is ln 2 for the losses and 0.5 for the accuracies; those of the control (k = 0) must stay there.
+#: Chance is ln 2 for losses and 0.5 for accuracies. The leak control (k = 0) must stay there.
 CLASSIFIER_METRICS = ["por_loss", "por_accuracy", "por_leak_loss", "por_leak_accuracy"]
-#: How hard the critic's loss and the weighted POR loss pull at the encoder.
+#: Gradient norms with respect to the encoder: of the critic's loss, and of the weighted POR loss.
 GRADIENT_METRICS = ["encoder_grad_norm_critic", "encoder_grad_norm_por"]
 ORDER_METRICS = [*CLASSIFIER_METRICS, *GRADIENT_METRICS]
 ORDER_COLUMNS = [*RUN_KEYS, "step", *ORDER_METRICS]
+#: How TensorBoard names its files.
+EVENT_FILES = "events.out.tfevents.*"
 
 
-def read_order(paths: Iterable[str | Path]) -> pd.DataFrame:
+class NoLogs(UserError):
+    """The TensorBoard files of a run are missing, or cannot be told from those of other runs."""
+
+
+def read_order(paths: Iterable[str | Path]) -> tuple[pd.DataFrame, list[str]]:
     """
+    Read the order table of many runs.
+
     :param paths: run folders, folders that hold runs at any depth, and ``.csv`` files that :func:`write_order` wrote
-    :return: one row for each step at which a run logged its order objective, columns ``ORDER_COLUMNS``, sorted; NaN where
-        one of them was not logged; runs without that objective have no rows
-    :raises UserError: if a path holds no run, no run has logged the objective, or two runs of one algorithm and
-        environment have one seed
+    :return: the table, sorted, and a sentence on each run of POR that is left out; the table has the columns
+        ``ORDER_COLUMNS``, one row for each step at which a run logged the objective, NaN where a metric was not logged, and
+        no rows for runs without the objective
+    :raises UserError: if a path holds no run, a table lacks a column, or two runs of one algorithm and environment have the
+        same seed
     """
     given = [Path(path) for path in paths]
-    tables = [_read_csv(path) for path in given if path.suffix == ".csv"]
-    logged = find_order(given)
-    if logged is not None:
-        tables.append(logged)
-    if not tables:
-        raise UserError("no run has logged a POR loss; give the folders of runs of sac_por or tqc_por, with their tb/")
-    return join_runs(tables)
-
-
-def find_order(paths: Iterable[str | Path]) -> pd.DataFrame | None:
-    """
-    :param paths: as :func:`read_order` takes them; tables are passed over
-    :return: what the runs in the folders have logged; ``None`` if that is nothing
-    """
-    folders = [Path(path) for path in paths if Path(path).suffix != ".csv"]
-    tables = [table for table in map(read_order_of, find_runs(folders)) if len(table)]
-    return join_runs(tables) if tables else None
+    tables, notes = [_read_csv(path) for path in given if path.suffix == ".csv"], []
+    for run in find_runs(path for path in given if path.suffix != ".csv"):
+        try:
+            tables.append(read_order_of(run))
+        except NoLogs as error:
+            if "por" in str(run_arguments(run).get("algo", run.parent.name)):
+                notes.append(f"POR's logs: {run} is left out: {error}")
+    tables = [table for table in tables if len(table)]
+    return join_runs(tables) if tables else pd.DataFrame(columns=ORDER_COLUMNS), notes
 
 
 def read_order_of(run: Path) -> pd.DataFrame:
     """
+    Read the order table of one run.
+
     :param run: a run folder
-    :return: its rows of the table; none if it has no TensorBoard files, or none with the objective
+    :return: its rows; none if it has logged no POR loss
+    :raises NoLogs: if it has no TensorBoard files
     """
-    logging.getLogger("tensorboard").setLevel(logging.ERROR)  # a killed run's last record is cut off, which it would tell
     events: dict[str, list[tuple[float, int, float]]] = {metric: [] for metric in ORDER_METRICS}
-    for folder in sorted({file.parent for file in run.glob("tb/**/events.out.tfevents.*")}):
-        log = EventAccumulator(str(folder), size_guidance={"scalars": 0})
-        log.Reload()
+    for log in _logs_of(run):
         for metric in set(ORDER_METRICS) & {tag.removeprefix("train/") for tag in log.Tags()["scalars"]}:
             events[metric] += [(event.wall_time, event.step, event.value) for event in log.Scalars(f"train/{metric}")]
     if not events["por_loss"]:
-        events = {metric: [] for metric in ORDER_METRICS}  # other objectives log how hard the critic pulls, too
+        events = {metric: [] for metric in ORDER_METRICS}  # other objectives log gradient norms, too
     columns = {metric: _latest(logged) for metric, logged in events.items()}
     table = pd.DataFrame(columns, columns=ORDER_METRICS, dtype=float).rename_axis("step").reset_index()
     for key, value in run_identity(run).items():
@@ -72,13 +74,66 @@ def read_order_of(run: Path) -> pd.DataFrame:
 
 
 def write_order(order: pd.DataFrame, path: str | Path) -> None:
-    """Write a table of order; reading it gives the same table."""
+    """Write an order table; reading it gives the same table."""
     with atomic_write(path) as temporary:
         order.to_csv(temporary, index=False, columns=ORDER_COLUMNS)
 
 
+def _logs_of(run: Path) -> list[EventAccumulator]:
+    """
+    The TensorBoard logs of a run: those in its ``tb/``, and those in the ``tensorboard_log`` that ``args.yml`` names
+    (``train.py -tb DIR`` and ``--track``). Runs may share that folder, so its logs must agree with the run's evaluations.
+    """
+    own = _open_logs(run / "tb")
+    shared = run_arguments(run).get("tensorboard_log")
+    if not shared:
+        if not own:
+            raise NoLogs(f"there are no TensorBoard files in {run / 'tb'}")
+        return own
+    settings = next(run.glob("*/args.yml")).parent
+    folder = _started_in(run) / shared / settings.name
+    arrays = read_evaluations(run)
+    evaluations = dict(zip(arrays["timesteps"].tolist(), arrays["results"].mean(axis=1).tolist(), strict=True))
+    logs = [log for log in _open_logs(folder) if _agrees(log, evaluations)]
+    if not own and not logs:
+        raise NoLogs(f"no TensorBoard file in {folder} has its evaluations")
+    first = min(evaluations)
+    if sum(first in _evaluations(log) for log in logs) > 1:
+        raise NoLogs(f"several TensorBoard files in {folder} have its evaluations, and nothing tells which are its own")
+    return own + logs
+
+
+def _open_logs(folder: Path) -> list[EventAccumulator]:
+    """All logs at any depth of a folder, loaded."""
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it would warn of the last record of a killed run
+    logs = []
+    for parent in sorted({file.parent for file in folder.rglob(EVENT_FILES)}):
+        logs.append(EventAccumulator(str(parent), size_guidance={"scalars": 0}))
+        logs[-1].Reload()
+    return logs
+
+
+def _started_in(run: Path) -> Path:
+    """The folder that a run's relative paths refer to; the current one if the run was moved."""
+    log_folder = run_arguments(run).get("log_folder", "")
+    run = run.resolve()
+    return next((base for base in run.parents if (base / log_folder).resolve() == run.parents[1]), Path.cwd())
+
+
+def _evaluations(log: EventAccumulator) -> dict[int, float]:
+    """Step -> mean return of each evaluation in a log."""
+    tag = "eval/mean_reward"
+    return {event.step: event.value for event in log.Scalars(tag)} if tag in log.Tags()["scalars"] else {}
+
+
+def _agrees(log: EventAccumulator, evaluations: dict[int, float]) -> bool:
+    """Whether a log has evaluations of a run, and none that differs from the run's."""
+    both = [(value, evaluations[step]) for step, value in _evaluations(log).items() if step in evaluations]
+    return bool(both) and bool(np.allclose(*zip(*both, strict=True), rtol=1e-5))  # TensorBoard keeps float32
+
+
 def _latest(events: list[tuple[float, int, float]]) -> pd.Series:
-    """Values by step. What a killed run had logged after the checkpoint that it went on from is logged again: it goes."""
+    """Values by step. A resumed run logs again what was logged after its checkpoint: the latest value counts."""
     kept: dict[int, float] = {}
     earliest = math.inf
     for _, step, value in sorted(events, reverse=True):
@@ -94,5 +149,5 @@ def _read_csv(path: Path) -> pd.DataFrame:
         raise UserError(f"cannot read {path}: {one_line(error)}") from error
     missing = [column for column in [*RUN_KEYS, "step", "por_loss"] if column not in order]
     if missing:
-        raise UserError(f"{path} has no column {', '.join(missing)}; a table of order has {','.join(ORDER_COLUMNS)}")
+        raise UserError(f"{path} has no column {', '.join(missing)}; an order table has {','.join(ORDER_COLUMNS)}")
     return order.reindex(columns=ORDER_COLUMNS)

@@ -14,9 +14,9 @@ import pandas as pd
 
 from sb3_por.analysis.diagnostics import check_order
 from sb3_por.analysis.figures import Plot, plot_all, save_all
-from sb3_por.analysis.learning_curves import in_order
+from sb3_por.analysis.learning_curves import sort_algos
 from sb3_por.analysis.plots import LABELS
-from sb3_por.analysis.por_logs import find_order
+from sb3_por.analysis.por_logs import read_order
 from sb3_por.analysis.saliency import draw_saliency
 from sb3_por.analysis.scores import METRICS, RUN_KEYS, join_runs, read_csv, read_run
 from sb3_por.common.errors import UserError
@@ -109,8 +109,9 @@ def write_report(
         notes.append("no run was evaluated: there is nothing to plot")
     else:
         metric = metric or next((name for name in METRICS if scores[name].notna().any()), METRICS[0])
-        plots, left_out = plot_all(scores, find_order([run.folder for run in _evaluated(runs)]), metric, step, seed=seed)
-        notes += left_out
+        order, without_logs = read_order([run.folder for run in _evaluated(runs)])
+        plots, left_out = plot_all(scores, order, metric, step, seed=seed)
+        notes += without_logs + left_out
         save_all(plots, folder / FIGURES)
         if videos:
             shown = _show_models(_best_runs(runs, scores, metric), notes)
@@ -211,7 +212,7 @@ def _best_runs(runs: list[RunFacts], scores: pd.DataFrame, metric: str) -> Itera
     """Of each task and algorithm the run with the best evaluation among those that have kept a model."""
     with_model = [run for run in runs if (run.folder / "best_model.zip").is_file()]
     for env in sorted({run.env for run in with_model}):
-        for algo in in_order(run.algo for run in with_model if run.env == env):
+        for algo in sort_algos(run.algo for run in with_model if run.env == env):
             members = [run for run in with_model if (run.env, run.algo) == (env, algo)]
             best = [_rows_of(run, scores)[metric].max() for run in members]
             if np.isfinite(best).any():

@@ -1,4 +1,4 @@
-"""Numbers from runs: curves, aggregates and comparisons, with 95 % stratified bootstrap intervals through rliable."""
+"""Curves, aggregates and comparisons of runs, with 95 % stratified bootstrap intervals by rliable."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,17 +13,17 @@ from sb3_por.analysis.learning_curves import STATE_ALGOS, Grid, read_grid
 from sb3_por.analysis.por_logs import ORDER_METRICS
 from sb3_por.common.errors import UserError
 
-#: Bootstrap samples.
+#: Number of bootstrap samples.
 REPS = 2000
-#: Metrics whose best value is 1, which is what an optimality gap is measured from.
+#: Metrics whose best value is 1: their optimality gap is the distance to it.
 UNIT_METRICS = ("normalized_performance", "success")
-#: Thresholds of a performance profile.
+#: Number of thresholds of a performance profile.
 N_THRESHOLDS = 101
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
     """
-    Interquartile mean over runs and tasks, all evaluations at once: ten times as fast as rliable's one by one.
+    Interquartile mean over runs and tasks, for all evaluations at once. Ten times as fast as rliable, which takes one by one.
 
     :param scores: shape ``(runs, tasks, evaluations)``
     :return: shape ``(evaluations,)``
@@ -33,11 +33,11 @@ def iqm(scores: np.ndarray) -> np.ndarray:
 
 def iqm_curves(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     """
-    The sample-efficiency curve: interquartile mean over seeds and tasks at each evaluation.
+    Sample-efficiency curves: interquartile mean over seeds and tasks at each evaluation.
 
-    :param grid: the runs
-    :param reps: bootstrap samples
-    :param seed: of the bootstrap; the same scores and seed give the same intervals
+    :param grid: the learning curves
+    :param reps: number of bootstrap samples
+    :param seed: seed of the bootstrap; the same scores and seed give the same intervals
     :return: columns algo, step, iqm, low, high, seeds (of each task), tasks, envs (their names)
     """
     tables = []
@@ -46,29 +46,29 @@ def iqm_curves(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
         value, low, high = _interval(matrix, iqm, reps, seed)
         n_seeds, n_tasks, _ = matrix.shape
         columns = {"algo": algo, "step": steps, "iqm": value, "low": low, "high": high, "seeds": n_seeds, "tasks": n_tasks}
-        tables.append(pd.DataFrame({**columns, "envs": " ".join(sorted({run.env for run in grid.of(algo)}))}))
+        tables.append(pd.DataFrame({**columns, "envs": " ".join(sorted({curve.env for curve in grid.of(algo)}))}))
     return pd.concat(tables, ignore_index=True)
 
 
 def task_curves(grid: Grid) -> pd.DataFrame:
     """
-    Each task by itself: mean and standard deviation over seeds, as in the paper's Figure 4.
+    Mean and standard deviation over seeds for each task, as in the paper's Figure 4.
 
     :return: columns env, algo, step, mean, std (of the population; 0 for one seed), seeds
     """
     tables = []
     for env in grid.envs:
         for algo in grid.algos:
-            runs = grid.of(algo, env)
-            if not runs:
+            curves = grid.of(algo, env)
+            if not curves:
                 grid.note(f"{algo} was not run on {env}")
                 continue
             try:
-                steps, scores = grid.table(runs, f"{algo} on {env}")
+                steps, scores = grid.table(curves, f"{algo} on {env}")
             except UserError as error:
                 grid.note(f"left out: {error}")
                 continue
-            columns = {"mean": scores.mean(axis=0), "std": scores.std(axis=0), "seeds": len(runs)}
+            columns = {"mean": scores.mean(axis=0), "std": scores.std(axis=0), "seeds": len(curves)}
             tables.append(pd.DataFrame({"env": env, "algo": algo, "step": steps, **columns}))
     if not tables:
         raise UserError("; ".join(grid.notes))
@@ -77,15 +77,15 @@ def task_curves(grid: Grid) -> pd.DataFrame:
 
 def order_curves(order: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     """
-    Loss and accuracy of the partial-order classifier and of its control, mean and standard deviation over seeds, as in the
-    paper's Figures 5 and 6.
+    Loss and accuracy of POR's classifier and of its leak control, mean and standard deviation over seeds, as in the paper's
+    Figures 5 and 6.
 
-    :param order: of :func:`sb3_por.analysis.por_logs.read_order`
-    :return: columns of :func:`task_curves` and metric, one of ``ORDER_METRICS``; and what was left out
+    :param order: an order table, see :func:`sb3_por.analysis.por_logs.read_order`
+    :return: columns of :func:`task_curves` and metric, one of ``ORDER_METRICS``; and a sentence on everything left out
     """
     tables, notes = [], []
     for metric in ORDER_METRICS:
-        logged = order.dropna(subset=[metric])  # the control is logged less often
+        logged = order.dropna(subset=[metric])  # the leak control is logged less often
         if len(logged):
             grid = read_grid(logged, metric)
             tables.append(task_curves(grid).assign(metric=metric))
@@ -95,8 +95,8 @@ def order_curves(order: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 def aggregates(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     """
-    One number an algorithm at the last step that all runs have: interquartile mean, mean, and, for metrics whose best
-    value is 1, optimality gap (how far below 1 the scores are on average, those above 1 counted as 1).
+    Interquartile mean and mean of each algorithm at the last step that all runs reach. Metrics whose best value is 1 also
+    have the optimality gap: 1 minus the mean of the scores, scores above 1 counted as 1.
 
     :return: columns algo, statistic, value, low, high, step, seeds, tasks
     """
@@ -116,17 +116,17 @@ def aggregates(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
 
 def performance_profiles(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     """
-    Which fraction of an algorithm's runs scores above each threshold, at the last step that all runs have.
+    Fraction of each algorithm's runs above each threshold, at the last step that all runs reach.
 
     :return: columns algo, threshold, fraction, low, high, step, seeds, tasks
     """
     step, matrices = grid.last()
-    every = np.concatenate([matrix.ravel() for matrix in matrices.values()])
-    low, high = (0.0, 1.0) if grid.metric in UNIT_METRICS else (float(every.min()), float(every.max()))
+    all_scores = np.concatenate([matrix.ravel() for matrix in matrices.values()])
+    low, high = (0.0, 1.0) if grid.metric in UNIT_METRICS else (float(all_scores.min()), float(all_scores.max()))
     thresholds = np.linspace(low, high, N_THRESHOLDS)
 
     def above(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-        """Rliable's ``score_distributions``, which is one call a threshold, all at once."""
+        """Rliable's ``score_distributions``, for all thresholds at once."""
         return 1 - np.searchsorted(np.sort(scores, axis=None), thresholds, side="right") / scores.size
 
     tables = []
@@ -141,8 +141,8 @@ def performance_profiles(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.Data
 
 def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
     """
-    How likely a run of one algorithm beats one of another on the same task, a draw counted as half; mean over the tasks.
-    The same as rliable's, which is too slow to be resampled for many pairs.
+    Probability that a run of one algorithm beats a run of another on the same task, mean over tasks. A draw counts as half.
+    Equal to rliable's, which is too slow to be resampled for many pairs.
 
     :param x: scores ``(runs, tasks)``
     :param y: scores ``(runs, tasks)``; the numbers of runs may differ
@@ -153,10 +153,10 @@ def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
 
 def improvements(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     """
-    Probability of improvement of each pair of algorithms at the last step that all runs have.
+    Probability of improvement of each pair of algorithms at the last step that all runs reach.
 
-    :return: columns algo, rival, probability (that algo beats rival), low, high, step, seeds (of the one that has fewer),
-        tasks; no rows for one algorithm
+    :return: columns algo, rival, probability (that algo beats rival), low, high, step, seeds (the smaller number of both),
+        tasks; no rows for a single algorithm
     """
     step, matrices = grid.last()
     pairs = list(combinations(grid.algos, 2))
@@ -177,25 +177,25 @@ def improvements(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
 
 def ratios(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     """
-    Each algorithm's mean over seeds divided by its best rival's, task by task, at the last step that the task's runs have.
-    Who is the best rival is asked anew in each bootstrap sample, so that the interval knows of that choice. Algorithms that
-    see the state (``STATE_ALGOS``) take no part.
+    Ratio of each algorithm's mean over seeds to its best rival's, for each task, at the last step that the task's runs
+    reach. Each bootstrap sample chooses the best rival anew, so the interval includes that choice. Algorithms that observe
+    the state (``STATE_ALGOS``) are left out.
 
     :return: columns env, algo, score, rival, rival_score, ratio, low, high, step, seeds; NaN or infinite where the rival's
         mean is not positive
     """
     algos = [algo for algo in grid.algos if algo not in STATE_ALGOS]
     if set(grid.algos) - set(algos):
-        grid.note(f"{' and '.join(STATE_ALGOS)} sees the state, so it is nobody's rival in the ratios")
+        grid.note(f"{' and '.join(STATE_ALGOS)} observes the state, so the ratios leave it out")
     rows = []
     for env in grid.envs:
-        runs = [run for run in grid.of(env=env) if run.algo in algos]
+        curves = [curve for curve in grid.of(env=env) if curve.algo in algos]
         here = [algo for algo in algos if grid.of(algo, env)]
         if len(here) < 2:
             grid.note(f"{env}: no two algorithms that learn from images, so no ratio")
             continue
-        steps, table = grid.table(runs, f"{env}, all algorithms")
-        scores = [table[[run.algo == algo for run in runs], -1:] for algo in here]
+        steps, table = grid.table(curves, f"{env}, all algorithms")
+        scores = [table[[curve.algo == algo for curve in curves], -1:] for algo in here]
         means = np.array([one.mean() for one in scores])
         value, low, high = _interval(scores, _ratios, reps, seed)
         for i, algo in enumerate(here):
@@ -213,7 +213,7 @@ def _best_rival(means: np.ndarray, i: int) -> int:
 
 
 def _ratios(*scores: np.ndarray) -> np.ndarray:
-    """The mean of each algorithm divided by that of its best rival."""
+    """Ratio of each algorithm's mean to its best rival's."""
     means = np.array([one.mean() for one in scores])
     best = np.array([means[_best_rival(means, i)] for i in range(len(means))])
     undefined = np.where(means > 0, np.inf, np.nan)
@@ -224,9 +224,13 @@ def _interval(
     scores: np.ndarray | list[np.ndarray], measure: Callable[..., np.ndarray], reps: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    :param scores: of one algorithm ``(runs, tasks, ...)``, or of several that are resampled independently
-    :param measure: of all of them, to an array
-    :return: the measure, and both ends of its interval
+    Measure scores, with a bootstrap interval.
+
+    :param scores: scores of one algorithm, ``(runs, tasks, ...)``, or of several, which are resampled independently
+    :param measure: scores -> array
+    :param reps: number of bootstrap samples
+    :param seed: seed of the bootstrap
+    :return: the measure, and the low and the high end of its interval
     """
     with _seeded(seed), np.errstate(invalid="ignore"):
         value, interval = rly.get_interval_estimates({"": scores}, measure, reps=reps)
@@ -235,7 +239,7 @@ def _interval(
 
 @contextmanager
 def _seeded(seed: int) -> Iterator[None]:
-    """Rliable draws from NumPy's global generator and ignores its own argument for one."""
+    """Seed NumPy's global generator and restore it: rliable draws from it and ignores its own argument."""
     state = np.random.get_state()
     np.random.seed(seed)
     try:

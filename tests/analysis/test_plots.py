@@ -9,9 +9,12 @@ from made_runs import log_order, random_scores, table, write_run
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_por.analysis.figures import KINDS, plot, plot_all, plot_order, save_all
-from sb3_por.analysis.plot_style import KNOWN, looks
-from sb3_por.analysis.por_logs import GRADIENT_METRICS, find_order, read_order, write_order
+from sb3_por.analysis.plot_style import COLORS, looks
+from sb3_por.analysis.por_logs import GRADIENT_METRICS, ORDER_COLUMNS, read_order, write_order
+from sb3_por.analysis.scores import read_scores
 from sb3_por.common.errors import UserError
+
+NO_ORDER = pd.DataFrame(columns=ORDER_COLUMNS)
 
 
 def texts(figure):
@@ -57,11 +60,16 @@ def test_what_is_drawn_is_what_is_in_the_table():
 
 
 def test_an_algorithm_looks_the_same_beside_any_others_and_unlike_them():
-    colors = [looks(["por_lambda_0", "por_paper"])[name].color for name in (*KNOWN, "por_lambda_0", "por_paper")]
-    assert len(set(colors)) == len(colors)
-    many = looks([*KNOWN, *(f"other{i}" for i in range(20))])
+    others = [f"other{i}" for i in range(56)]
+    many = looks([*COLORS, *others])
     assert len(set(many.values())) == len(many)
-    assert looks(["sac"])["sac"] == looks(["ppo", "sac", "a2c"])["sac"]
+    assert looks(reversed([*COLORS, *others])) == many
+    assert all(looks([name, "ppo"])[name] == many[name] for name in COLORS)
+    alone = {name: looks([name])[name] for name in others}
+    assert looks(["por_10", "a2c", "my_variant"])["por_10"] == looks(["por_10"])["por_10"]
+    same = next([a, b] for a in others for b in others if a < b and alone[a] == alone[b])
+    assert looks(same)[same[0]] == alone[same[0]] != looks(same)[same[1]]
+    assert len(looks(map(str, range(100)))) == 100
 
 
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg", "csv"])
@@ -88,32 +96,32 @@ def test_a_figure_of_nothing_is_refused_and_left_out_of_all():
     }.items():
         with pytest.raises(UserError, match=message):
             plot(alone, kind)
-    plots, notes = plot_all(alone, reps=20)
+    plots, notes = plot_all(alone, NO_ORDER, reps=20)
     assert [one.name for one in plots] == ["iqm", "tasks", "aggregates", "profile"]
     assert any("no probability of improvement" in note for note in notes) and any("no ratio" in note for note in notes)
     short = random_scores(algos=("c",), n_seeds=2)
     short.loc[short["seed"] == 0, "step"] += 10_000
-    plots, notes = plot_all(pd.concat([alone, short]), reps=20)
+    plots, notes = plot_all(pd.concat([alone, short]), NO_ORDER, reps=20)
     assert "tasks" in [one.name for one in plots]
     assert any(note.startswith("left out: c on ") and "no step in common" in note for note in notes)
     apart = pd.concat([random_scores(algos=("a",), envs=("T",)), random_scores(algos=("b",), envs=("U",))])
-    plots, notes = plot_all(apart, reps=20)
+    plots, notes = plot_all(apart, NO_ORDER, reps=20)
     assert [one.name for one in plots] == ["iqm", "tasks"]
     assert any(note.startswith("no figure profile: no environment was run with every algorithm") for note in notes)
 
 
 def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
     for seed, losses in enumerate([(0.7, 0.6, 0.5), (0.7, 0.4, 0.1)]):
-        log_order(write_run(tmp_path, seed=seed), losses)
+        log_order(write_run(tmp_path, seed=seed) / "tb" / "SACPOR_1", losses)
     other = write_run(tmp_path, algo="sac_curl", seed=0)
     with SummaryWriter(other / "tb" / "SACCURL_1") as writer:
         writer.add_scalar("train/encoder_grad_norm_critic", 1.0, 100)
-    order = read_order([tmp_path])
-    assert set(order["algo"]) == {"sac_por"} and order["step"].tolist() == [100, 200, 300] * 2
+    order, left_out = read_order([tmp_path])
+    assert left_out == [] and set(order["algo"]) == {"sac_por"} and order["step"].tolist() == [100, 200, 300] * 2
     assert order["por_loss"].to_numpy() == pytest.approx([0.7, 0.6, 0.5, 0.7, 0.4, 0.1])
     assert order["por_leak_loss"].isna().all()
     write_order(order, tmp_path / "order.csv")
-    pd.testing.assert_frame_equal(read_order([tmp_path / "order.csv"]), order)
+    pd.testing.assert_frame_equal(read_order([tmp_path / "order.csv"])[0], order)
     one, notes = plot_order(order)
     loss = one.table[one.table["metric"] == "por_loss"]
     assert loss["mean"].to_numpy() == pytest.approx([0.7, 0.5, 0.3]) and not notes
@@ -128,19 +136,41 @@ def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
 
 def test_what_a_resumed_run_logs_again_replaces_what_it_had_logged(tmp_path):
     run = write_run(tmp_path)
-    log_order(run, [0.7, 0.6, 0.5, 0.4])
-    log_order(run, [0.3, 0.2], first_step=300)
-    log_order(run, [0.1], folder="SACPOR_2", first_step=400)
-    order = read_order([run])
+    log_order(run / "tb" / "SACPOR_1", [0.7, 0.6, 0.5, 0.4])
+    log_order(run / "tb" / "SACPOR_1", [0.3, 0.2], first_step=300)
+    log_order(run / "tb" / "SACPOR_2", [0.1], first_step=400)
+    order, _ = read_order([run])
     assert order["step"].tolist() == [100, 200, 300, 400]
     assert order["por_loss"].to_numpy() == pytest.approx([0.7, 0.6, 0.3, 0.1])
 
 
+def test_logs_are_found_where_the_runs_settings_point(tmp_path):
+    tensorboard = {"log_folder": "logs", "tensorboard_log": "tb"}
+    returns = {seed: [10.0 + seed, 20.0, 40.0] for seed in (0, 1)}
+    for seed, rewards in returns.items():
+        run = write_run(tmp_path / "logs", seed=seed, performance=np.array(rewards) / 100, arguments=tensorboard)
+        log_order(tmp_path / "tb" / "PourWater-v0" / f"SACPOR_{seed + 1}", [0.7, 0.6 - 0.1 * seed], returns=rewards)
+    log_order(tmp_path / "tb" / "Other-v0" / "SACPOR_1", [0.1], returns=returns[0])
+    order, left_out = read_order([tmp_path / "logs"])
+    assert left_out == [] and order["seed"].tolist() == [0, 0, 1, 1]
+    assert order["por_loss"].to_numpy() == pytest.approx([0.7, 0.6, 0.7, 0.5])
+
+    log_order(tmp_path / "tb" / "PourWater-v0" / "SACPOR_3", [0.3], returns=returns[1])
+    order, left_out = read_order([tmp_path / "logs"])
+    assert set(order["seed"]) == {0}
+    assert len(left_out) == 1 and str(run) in left_out[0] and "several TensorBoard files" in left_out[0]
+
+
 def test_runs_without_an_order_are_said(tmp_path):
-    run = write_run(tmp_path, algo="sac")
-    assert find_order([run, "scores.csv"]) is None
+    plain, lost = write_run(tmp_path, algo="sac"), write_run(tmp_path, arguments={"tensorboard_log": "/tmp/lost"})
+    order, left_out = read_order([plain, lost])
+    assert order.empty
+    assert left_out == [f"POR's logs: {lost} is left out: no TensorBoard file in /tmp/lost/PourWater-v0 has its evaluations"]
     with pytest.raises(UserError, match="no run has logged a POR loss"):
-        read_order([run])
+        plot_order(order)
+    assert any(
+        note.startswith("no figure order: no run has logged") for note in plot_all(read_scores([plain]), order, reps=20)[1]
+    )
     (tmp_path / "scores.csv").write_text("env,algo,seed,step\n")
     with pytest.raises(UserError, match="has no column por_loss"):
         read_order([tmp_path / "scores.csv"])
@@ -156,7 +186,7 @@ def test_a_grid_of_five_algorithms_four_tasks_five_seeds_is_quick(tmp_path):
 
 
 def test_all_figures_are_saved_in_all_formats_under_their_names(tmp_path):
-    plots, _ = plot_all(random_scores(n_seeds=2), reps=20)
+    plots, _ = plot_all(random_scores(n_seeds=2), NO_ORDER, reps=20)
     save_all(plots, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {f"{kind}.{end}" for kind in KINDS for end in ("png", "pdf", "csv")}
     assert np.allclose(pd.read_csv(tmp_path / "iqm.csv")["iqm"], plots[0].table["iqm"], atol=1e-6)

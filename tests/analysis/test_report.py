@@ -82,7 +82,7 @@ def suite(tmp_path_factory):
             (run / f"{ENV}.zip").touch()
         for seed in (0, 1):
             model_of[algo]().save(root / ENV / algo / f"seed_{seed}" / algo / f"{ENV}_{seed}" / "best_model.zip")
-    log_order(root / ENV / "sac_por" / "seed_0" / "sac_por" / f"{ENV}_0", [0.7, 0.5])
+    log_order(root / ENV / "sac_por" / "seed_0" / "sac_por" / f"{ENV}_0" / "tb" / "SACPOR_1", [0.7, 0.5])
     stopped = root / ENV / "sac" / "seed_1"
     (stopped / "sac" / f"{ENV}_1" / f"{ENV}.zip").unlink()
     (stopped / "log.txt").write_text("\n".join(f"line {i}" for i in range(100)) + "\nKilled: <b>out of memory</b>\n")

@@ -191,7 +191,7 @@ def test_ratio_to_the_best_rival():
     assert table_["ratio"].to_dict() == pytest.approx({"sac_por": 1.4, "sac_curl": 0.2 / 0.7, "sac_drq": 0.5 / 0.7})
     # Two seeds: a quarter of the samples each is the lower one twice, and the higher one twice.
     assert table_.loc["sac_por", ["low", "high"]].tolist() == pytest.approx([1.2, 1.6])
-    assert grid.notes == ["sac sees the state, so it is nobody's rival in the ratios"]
+    assert grid.notes == ["sac observes the state, so the ratios leave it out"]
     early = ratios(read_grid(scores, step=150)).set_index("algo")
     assert early["ratio"].isna().all(), "0 / 0 at the beginning"
 

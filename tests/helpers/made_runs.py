@@ -11,14 +11,22 @@ STEPS = [100, 200, 300]
 
 
 def write_run(
-    folder, algo="sac_por", env="PourWater-v0", seed=1, performance=(0.1, 0.2, 0.4), steps=STEPS, settings=True, label=None
+    folder,
+    algo="sac_por",
+    env="PourWater-v0",
+    seed=1,
+    performance=(0.1, 0.2, 0.4),
+    steps=STEPS,
+    settings=True,
+    label=None,
+    arguments=(),
 ):
     """A run folder as train.py leaves it, two episodes an evaluation."""
     run = folder / algo / f"{env}_{seed}"
     (run / env).mkdir(parents=True)
     if settings:
-        arguments = {"algo": algo, "env": env, "seed": seed, "commit": "abc", "label": label}
-        (run / env / "args.yml").write_text(yaml.safe_dump(arguments))
+        recorded = {"algo": algo, "env": env, "seed": seed, "commit": "abc", "label": label}
+        (run / env / "args.yml").write_text(yaml.safe_dump(recorded | dict(arguments)))
     episodes = np.array(performance)[:, None] + np.array([-0.05, 0.05])
     np.savez(
         run / "evaluations.npz",
@@ -32,9 +40,11 @@ def write_run(
     return run
 
 
-def log_order(run, losses, folder="SACPOR_1", first_step=100):
-    """TensorBoard files as a run of POR writes them."""
-    with SummaryWriter(run / "tb" / folder) as writer:
+def log_order(folder, losses, first_step=100, returns=()):
+    """TensorBoard files as a run of POR writes them, perhaps with the mean returns of its evaluations."""
+    with SummaryWriter(folder) as writer:
+        for step, mean_return in zip(STEPS, returns, strict=False):
+            writer.add_scalar("eval/mean_reward", mean_return, step)
         for i, loss in enumerate(losses):
             writer.add_scalar("train/por_loss", loss, first_step + 100 * i)
             writer.add_scalar("train/por_accuracy", 1 - loss, first_step + 100 * i)

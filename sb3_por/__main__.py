@@ -156,6 +156,8 @@ def _diagnose_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--csv", help="write that table here, too")
     _model_arguments(parser, required=False)
     parser.add_argument("-n", "--n-episodes", type=int, default=5, help="held-out episodes of each policy (default 5)")
+    fresh = "also train fresh heads on the frozen encoder, on an untrained one, and with sham labels, as controls"
+    parser.add_argument("--fresh-head", action="store_true", help=fresh)
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
@@ -169,14 +171,14 @@ def _diagnose(args: argparse.Namespace) -> None:
     if bool(args.paths) == bool(args.model and args.env) or (args.csv and not args.paths):
         raise UserError("give --model and --env, or folders of runs and perhaps --csv (diagnose --help lists the arguments)")
     if args.paths:
-        table = diagnose_runs(args.paths, args.n_episodes, args.seed)
+        table = diagnose_runs(args.paths, args.n_episodes, args.seed, args.fresh_head)
         if args.csv:
             table.to_csv(args.csv, index=False, float_format="%.5g")
         print(table.to_json(orient="records", indent=2) if args.json else table.round(3).to_string(index=False))
         return
     model, environment = _load(args)
     check_order(model)
-    diagnosis = diagnose(model, args.env, args.n_episodes, args.seed, **environment)
+    diagnosis = diagnose(model, args.env, args.n_episodes, args.seed, **environment, fresh_head=args.fresh_head)
     if args.json:
         print(json.dumps({"model": args.model, "env": args.env, "seed": args.seed, **diagnosis.as_dict()}, indent=2))
     else:

@@ -1,6 +1,5 @@
-"""What a trained objective has learned: order or encoder identity, and whether its potential follows the physics."""
+"""Diagnosis of a trained partial-order objective: order or encoder leak, and physical quantity or time."""
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,10 +8,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch as th
-from scipy.stats import ConstantInputWarning, spearmanr
-from stable_baselines3.common.utils import obs_as_tensor, set_random_seed
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.utils import set_random_seed
 
+from sb3_por.analysis import controls
+from sb3_por.analysis.controls import MEASURES, Controls
+from sb3_por.analysis.fresh_heads import judgement, train_head
+from sb3_por.analysis.played import Played, encode, play
 from sb3_por.common.errors import UserError
 from sb3_por.evaluation.episodes import evaluation_episodes
 from sb3_por.evaluation.evaluate import EnvWrapper, make_evaluation_env
@@ -20,30 +21,45 @@ from sb3_por.evaluation.loading import find_environment, load_model, trained_in
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.runs.facts import run_identity
 from sb3_por.runs.folder import find_runs, is_finished
-from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 
-#: Pairs of a batch, and batches that a number is the mean of.
+#: Pairs in a batch, and number of batches that a metric is averaged over.
 BATCH_SIZE, N_BATCHES = 256, 4
+#: Episodes that fresh heads are trained on.
+N_HEAD_EPISODES = 20
+#: Order -> its name in the printed table. The first is the model's own; the last three need ``fresh_head``.
+ORDERS = {
+    "own": "its own head",
+    "clock": "clock: the frame's number",
+    "fresh": "fresh head",
+    "untrained": "fresh head, untrained encoder",
+    "sham": "fresh head, order by chance",
+}
+#: Names of the measures in the printed table, and their values at chance.
+HEADER = ("r", "r given time", "r at equal time", "pairs", "unchanged", "changed", "at equal time")
+CHANCE = (np.nan, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
 class Diagnosis:
     """
-    Losses are per term, so that chance is ln 2 = 0.693; accuracies are fractions, chance 0.5.
+    Losses are per term, so chance is ln 2 = 0.693. Accuracies are fractions, chance 0.5.
 
-    :param loss: POR loss on the policy's own frames
-    :param accuracy: how often the classifier is right on them
-    :param leak_loss: POR loss on pairs of a frame with itself (k = 0): below ln 2 the classifier reads the encoders
-    :param leak_accuracy: the same as an accuracy
+    :param loss: POR loss on pairs of the policy's own frames, as in training
+    :param accuracy: accuracy of the classifier on them
+    :param leak_loss: POR loss on pairs of a frame with itself (k = 0); below ln 2 the classifier tells the encoders apart
+    :param leak_accuracy: accuracy on them
     :param random_loss: POR loss on frames of a random policy
-    :param random_accuracy: the same as an accuracy
-    :param grad_norm_critic: norm of the critic loss's gradient at the encoder
-    :param grad_norm_por: norm of the weighted POR loss's gradient there
-    :param feature_std: standard deviation of the encoder's features over the policy's own frames, mean of the features; near
-        0 the encoder has collapsed: it says the same of all frames
-    :param correlation: Spearman's correlation between the learned potential and ``info["monotone"]`` over an episode, mean
-        of the episodes in which that quantity changes; NaN if it never does
-    :param correlations: the same of each episode, NaN where the quantity is constant
+    :param random_accuracy: accuracy on them
+    :param grad_norm_critic: norm of the critic loss's gradient with respect to the encoder
+    :param grad_norm_por: norm of the weighted POR loss's gradient with respect to the encoder
+    :param feature_std: standard deviation of the encoder's features over the policy's own frames, mean over features; near 0
+        the encoder has collapsed to a constant
+    :param n_unchanged: pairs of an episode, k steps apart, with equal quantities
+    :param n_changed: the other pairs
+    :param n_equal_time: pairs of two episodes at the same step with different quantities
+    :param orders: key of ``ORDERS`` -> agreement of that order with time and quantity, on frames that one encoder encodes
+    :param correlations: Spearman correlation of the learned potential and ``info["monotone"]`` in each episode; NaN where the
+        quantity is constant
     """
 
     loss: float
@@ -55,33 +71,52 @@ class Diagnosis:
     grad_norm_critic: float
     grad_norm_por: float
     feature_std: float
-    correlation: float
+    n_unchanged: int
+    n_changed: int
+    n_equal_time: int
+    orders: dict[str, Controls]
     correlations: list[float]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: ``None`` stands for NaN."""
-        plain = asdict(self) | {"correlations": [None if np.isnan(value) else value for value in self.correlations]}
-        return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in plain.items()}
+        """
+        Flatten for JSON and tables.
+
+        :return: the fields, ``None`` for NaN; measures of the model's own order under their names, those of the other orders
+            under ``<order>_<measure>``
+        """
+        plain = asdict(self)
+        orders, correlations = plain.pop("orders"), plain.pop("correlations")
+        for order, measured in orders.items():
+            plain |= {name if order == "own" else f"{order}_{name}": value for name, value in measured.items()}
+        return {name: _none_for_nan(value) for name, value in plain.items()} | {
+            "correlations": [_none_for_nan(value) for value in correlations]
+        }
 
     def __str__(self) -> str:
-        rows = [
-            ("", "loss", "accuracy"),
-            ("frames of its own policy", f"{self.loss:.3f}", f"{self.accuracy:.3f}"),
-            ("frames of a random policy", f"{self.random_loss:.3f}", f"{self.random_accuracy:.3f}"),
-            ("leak control (k = 0)", f"{self.leak_loss:.3f}", f"{self.leak_accuracy:.3f}"),
-            ("chance", "0.693", "0.500"),
-        ]
-        table = "\n".join(f"{name:26s}{loss:>8s}{accuracy:>10s}" for name, loss, accuracy in rows)
-        return (
-            f"{table}\ngradient norm at the encoder: critic {self.grad_norm_critic:.3g}, POR {self.grad_norm_por:.3g}\n"
-            f"standard deviation of the encoder's features over frames: {self.feature_std:.3g}\n"
-            f"Spearman correlation of potential and monotone quantity: {self.correlation:.3f}"
+        pairs = {
+            "frames of its own policy": (self.loss, self.accuracy),
+            "frames of a random policy": (self.random_loss, self.random_accuracy),
+            "leak control (k = 0)": (self.leak_loss, self.leak_accuracy),
+            "chance": (np.log(2), 0.5),
+        }
+        orders = {ORDERS[name]: [getattr(order, measure) for measure in MEASURES] for name, order in self.orders.items()}
+        return "\n".join(
+            (
+                _printed(pairs, ("loss", "accuracy")),
+                f"gradient norm with respect to the encoder: critic {self.grad_norm_critic:.3g}, POR {self.grad_norm_por:.3g}",
+                f"standard deviation of the encoder's features over frames: {self.feature_std:.3g}",
+                "",
+                "Spearman correlation r with the monotone quantity, and accuracy on pairs:",
+                _printed(orders | {"chance": CHANCE}, HEADER),
+                f"pairs: {self.n_unchanged} unchanged, {self.n_changed} changed, {self.n_equal_time} at equal time",
+            )
         )
 
 
 def check_order(model: Any) -> PartialOrder:
     """
-    :return: the model's partial-order objective
+    Get a model's partial-order objective.
+
     :raises UserError: if it has none
     """
     objective = getattr(getattr(model, "policy", None), "objective", None)
@@ -98,17 +133,20 @@ def diagnose(
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
     env_wrapper: EnvWrapper | None = None,
+    fresh_head: bool = False,
 ) -> Diagnosis:
     """
     Play held-out episodes with a model and at random, and measure its partial-order objective on their frames.
 
     :param model: trained with a ``PartialOrder`` objective
-    :param env_id: a Gymnasium id; for the correlation one that reports ``info["monotone"]``
-    :param n_episodes: of each policy
-    :param seed: of the first episode, the random policy, and the pairs; the global generators are set to it
-    :param env_kwargs: for the environment's constructor
-    :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
-    :param env_wrapper: what the model was trained inside
+    :param env_id: a Gymnasium id; the controls need its ``info["monotone"]``
+    :param n_episodes: number of episodes of each policy
+    :param seed: seed of the first episode, the random policy, and the pairs; the global generators are set to it
+    :param env_kwargs: arguments of the environment's constructor
+    :param vec_normalize: file of the ``VecNormalize`` statistics from training
+    :param env_wrapper: the wrappers from training
+    :param fresh_head: also train fresh heads on other episodes of the policy and measure them on the same held-out frames: on
+        the frozen encoder, on an untrained one, and with sham labels
     :raises UserError: if the model learns no order, or was not trained on this environment
     """
     objective = check_order(model)
@@ -118,21 +156,26 @@ def diagnose(
     set_random_seed(seed)
     env.action_space.seed(seed)
     model.policy.set_training_mode(False)
+    episodes = evaluation_episodes(env_id, n_episodes + N_HEAD_EPISODES, seed)
     try:
-        episodes = evaluation_episodes(env_id, n_episodes, seed)
-        own, correlations = _play(model, env, episodes, at_random=False)
-        random, _ = _play(model, env, episodes, at_random=True)
+        own = play(model, env, episodes[:n_episodes])
+        random = play(model, env, episodes[:n_episodes], at_random=True)
+        others = play(model, env, episodes[n_episodes:]) if fresh_head else None
     finally:
         env.close()
 
-    batches = [model.sample(BATCH_SIZE, own) for _ in range(N_BATCHES)]
+    batches = [model.sample(BATCH_SIZE, own.transitions) for _ in range(N_BATCHES)]
     measured = [model.objective_metrics(batch) for batch in batches]
     leaks = [model.control_metrics(batch) for batch in batches]
-    at_random = [model.objective_metrics(model.sample(BATCH_SIZE, random)) for _ in range(N_BATCHES)]
+    at_random = [model.objective_metrics(model.sample(BATCH_SIZE, random.transitions)) for _ in range(N_BATCHES)]
     norms = model.encoder_grad_norms(model.losses(batches[0]))
-    with th.no_grad():
-        features = th.cat([model.critic.encode(batch.observations) for batch in batches])
-    changing = [value for value in correlations if not np.isnan(value)]
+    features = encode(model.critic, own.observations, model.device)
+    potential, belief = judgement(objective, features)
+    k = _distances(objective)[-1]
+    orders = {"own": controls.measure_controls(own.frames, potential, belief, k), "clock": controls.clock(own.frames, k)}
+    if others is not None:
+        orders |= _fresh_orders(model, own, others)
+    unchanged, changed = controls.by_change(own.frames, *controls.pairs_within_episodes(own.frames, [k]))
     return Diagnosis(
         loss=_mean(measured, "loss"),
         accuracy=_mean(measured, "accuracy"),
@@ -143,19 +186,23 @@ def diagnose(
         grad_norm_critic=float(norms["critic"]),
         grad_norm_por=float(norms[objective.name]),
         feature_std=float(features.std(dim=0).mean()),
-        correlation=float(np.mean(changing)) if changing else float("nan"),
-        correlations=correlations,
+        n_unchanged=int(unchanged.sum()),
+        n_changed=int(changed.sum()),
+        n_equal_time=len(controls.pairs_at_equal_time(own.frames)[0]),
+        orders=orders,
+        correlations=controls.within_episodes(own.frames, potential).tolist(),
     )
 
 
-def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int = 0) -> pd.DataFrame:
+def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int = 0, fresh_head: bool = False) -> pd.DataFrame:
     """
-    Diagnose the last model of every run that learns an order; other runs and unfinished ones are passed over.
+    Diagnose the last model of every finished run that learns an order.
 
     :param folders: run folders, or folders that hold some at any depth
-    :param n_episodes: as in :func:`diagnose`
-    :param seed: as in :func:`diagnose`
-    :return: one row a model: env, algo (or label), seed, step, and what a ``Diagnosis`` holds but single episodes
+    :param n_episodes: see :func:`diagnose`
+    :param seed: see :func:`diagnose`
+    :param fresh_head: see :func:`diagnose`
+    :return: one row for each model: env, algo (or label), seed, step, and ``Diagnosis.as_dict()`` without single episodes
     :raises UserError: if there is no such model
     """
     rows = []
@@ -168,7 +215,8 @@ def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int 
         model: Any = load_model(file)
         if not isinstance(getattr(model.policy, "objective", None), PartialOrder):
             continue
-        measured = diagnose(model, identity["env"], n_episodes, seed, **trained_in(file, identity["env"])).as_dict()
+        environment = trained_in(file, identity["env"])
+        measured = diagnose(model, identity["env"], n_episodes, seed, **environment, fresh_head=fresh_head).as_dict()
         del measured["correlations"]
         rows.append({**identity, "step": model.num_timesteps, **measured})
     if not rows:
@@ -176,53 +224,39 @@ def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int 
     return pd.DataFrame(rows).sort_values(["env", "algo", "seed"], ignore_index=True)
 
 
-def _play(model: Any, env: VecEnv, episodes: list[Any], at_random: bool) -> tuple[SequenceReplayBuffer, list[float]]:
-    """The transitions of these episodes, and each one's correlation of potential and monotone quantity."""
-    env.env_method("play", episodes)
-    observation: Any = env.reset()
-    monotone = [env.unwrapped.reset_infos[0].get("monotone", np.nan)]
-    frames = [observation]
-    transitions: list[Any] = []
-    correlations: list[float] = []
-    while len(correlations) < len(episodes):
-        action = np.array([env.action_space.sample()]) if at_random else model.predict(observation, deterministic=True)[0]
-        next_observation, reward, done, infos = env.step(action)
-        last = _batch(infos[0]["terminal_observation"]) if done[0] else next_observation
-        transitions.append((observation, last, model.policy.scale_action(action), reward, done, infos))
-        frames.append(last)
-        monotone.append(infos[0].get("monotone", np.nan))
-        if done[0]:
-            correlations.append(_correlation(model, frames, np.array(monotone)))
-            frames, monotone = [next_observation], [env.unwrapped.reset_infos[0].get("monotone", np.nan)]
-        observation = next_observation
-    buffer = SequenceReplayBuffer(
-        len(transitions), model.observation_space, model.action_space, model.device, n_steps=model.n_steps, gamma=model.gamma
-    )
-    for transition in transitions:
-        buffer.add(*transition)
-    return buffer, correlations
+def _fresh_orders(model: Any, held_out: Played, others: Played) -> dict[str, Controls]:
+    """Train fresh heads on the frames of other episodes, and measure them on held-out ones."""
+    trained = model.policy.objective
+    distances = _distances(trained)
+    pairs = controls.pairs_within_episodes(others.frames, distances)
+    orders = {}
+    for name, critic in (("fresh", model.critic), ("untrained", model.policy.make_critic()), ("sham", model.critic)):
+        critic.set_training_mode(False)
+        settings = {**model.policy.objective_kwargs, "pairing": "paper"}
+        head = type(trained)(trained.features_dim, trained.action_dim, **settings).to(model.device)
+        train_head(head, encode(critic, others.observations, model.device), *pairs, sham=name == "sham")
+        potential, belief = judgement(head, encode(critic, held_out.observations, model.device))
+        orders[name] = controls.measure_controls(held_out.frames, potential, belief, distances[-1])
+    return orders
 
 
-def _batch(observation: Any) -> Any:
-    """A batch of one observation."""
-    return {key: value[None] for key, value in observation.items()} if isinstance(observation, dict) else observation[None]
+def _distances(objective: PartialOrder) -> range:
+    """All distances k of the objective's pairs."""
+    shortest, longest = objective.future or (1, 1)
+    return range(shortest, longest + 1)
 
 
-def _concatenate(batches: list[Any]) -> Any:
-    """One batch of many."""
-    if isinstance(batches[0], dict):
-        return {key: np.concatenate([batch[key] for batch in batches]) for key in batches[0]}
-    return np.concatenate(batches)
+def _printed(rows: dict[str, Any], header: tuple[str, ...]) -> str:
+    """A table of numbers, one row for each name."""
+    lines = ["".join(f"  {title:>8s}" for title in header)]
+    for values in rows.values():
+        cells = ("-" if np.isnan(value) else f"{value:.3f}" for value in values)
+        lines.append("".join(f"  {cell:>{max(len(title), 8)}s}" for cell, title in zip(cells, header, strict=True)))
+    return "\n".join(f"{name:30s}{line}" for name, line in zip(["", *rows], lines, strict=True))
 
 
-def _correlation(model: Any, frames: list[Any], monotone: np.ndarray) -> float:
-    """Spearman's correlation over one episode; NaN where the quantity does not change."""
-    with th.no_grad():
-        features = model.critic.encode(obs_as_tensor(_concatenate(frames), model.device))
-        potential = model.policy.objective.potential(features).cpu().numpy()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConstantInputWarning)
-        return float(spearmanr(potential, monotone).statistic)
+def _none_for_nan(value: Any) -> Any:
+    return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _mean(metrics: list[dict[str, th.Tensor]], name: str) -> float:

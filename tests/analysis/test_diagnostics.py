@@ -15,10 +15,15 @@ from stable_baselines3 import SAC
 
 from sb3_por import SACPOR
 from sb3_por.__main__ import main
+from sb3_por.analysis import diagnostics, fresh_heads
+from sb3_por.analysis.controls import PlayedFrames, measure_controls, pairs_within_episodes
 from sb3_por.analysis.diagnostics import diagnose, diagnose_runs
+from sb3_por.analysis.fresh_heads import judgement, train_head
 from sb3_por.analysis.saliency import overlay, saliency_map
 from sb3_por.common.errors import UserError
 from sb3_por.evaluation.loading import load_model
+from sb3_por.objectives.base import EncodedBatch
+from sb3_por.objectives.por import PartialOrder
 
 
 @pytest.fixture(scope="module")
@@ -48,19 +53,23 @@ def test_a_potential_that_follows_the_ball_has_correlation_one(model, monkeypatc
     def row_of_the_ball(observations):
         redness = observations[:, 0].float() - observations[:, 1].float()
         rows = th.arange(redness.shape[1]).float()[None, :, None]
-        return ((redness.clamp(min=0) * rows).sum((1, 2)) / redness.clamp(min=0).sum((1, 2)).clamp(min=1))[:, None]
+        row = (redness.clamp(min=0) * rows).sum((1, 2)) / redness.clamp(min=0).sum((1, 2)).clamp(min=1)
+        return row[:, None].expand(-1, model.policy.objective.features_dim)
 
     monkeypatch.setattr(model.critic, "encode", row_of_the_ball)
     monkeypatch.setattr(model.policy.objective, "potential", lambda features: features[:, 0])
-    assert diagnose(model, "FallingBall-v0", n_episodes=1).correlation > 0.99
+    diagnosis = diagnose(model, "FallingBall-v0", n_episodes=3)
+    assert diagnosis.orders["own"].correlation > 0.99 and diagnosis.orders["clock"].correlation > 0.99
+    assert np.isnan(diagnosis.orders["own"].partial_correlation), "the ball falls at every step: time determines its ranks"
+    assert np.isnan(diagnosis.orders["own"].equal_time_correlation), "all balls fall alike"
     monkeypatch.setattr(model.policy.objective, "potential", lambda features: -features[:, 0])
-    assert diagnose(model, "FallingBall-v0", n_episodes=1).correlation < -0.99
+    assert diagnose(model, "FallingBall-v0", n_episodes=1).orders["own"].correlation < -0.99
 
 
 def test_a_model_that_sees_image_and_state_is_diagnosed_too():
     env = gym.make("FallingBall-v0", obs_type="dict", image_size=36)
     model = SACPOR("MultiInputPolicy", env, buffer_size=200, learning_starts=60, batch_size=16, seed=0).learn(70)
-    assert -1 <= diagnose(model, "FallingBall-v0", n_episodes=1).correlation <= 1
+    assert -1 <= diagnose(model, "FallingBall-v0", n_episodes=1).orders["own"].correlation <= 1
 
 
 def test_an_encoder_that_says_the_same_of_all_frames_is_found(model_file):
@@ -69,6 +78,45 @@ def test_an_encoder_that_says_the_same_of_all_frames_is_found(model_file):
     with th.no_grad():
         model.critic.projection.blocks[0][0].weight.zero_()
     assert diagnose(model, "FallingBall-v0", n_episodes=1).feature_std < 1e-6 < 0.01 < sound
+
+
+def test_fresh_heads_are_measured_beside_the_models_own(model, monkeypatch):
+    monkeypatch.setattr(fresh_heads, "N_UPDATES", 100)
+    monkeypatch.setattr(diagnostics, "N_HEAD_EPISODES", 2)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    plain, controlled = (diagnose(model, "FallingBall-v0", n_episodes=2, fresh_head=fresh) for fresh in (False, True))
+    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+    assert list(controlled.orders) == ["own", "clock", "fresh", "untrained", "sham"] == list(diagnostics.ORDERS)
+    assert plain.as_dict().items() <= controlled.as_dict().items(), "the controls change nothing else"
+    assert len({order.correlation for order in controlled.orders.values()}) == len(controlled.orders)
+    assert "fresh head, untrained encoder" in str(controlled) and "clock" in str(plain)
+
+
+def test_a_fresh_head_learns_what_is_in_the_features_and_no_sham(monkeypatch):
+    monkeypatch.setattr(fresh_heads, "N_UPDATES", 300)
+    th.manual_seed(0)
+    episode, step = np.repeat(np.arange(30), 20), np.tile(np.arange(20), 30)
+    frames = PlayedFrames(episode, step, step.astype(float))
+    told, untold = th.randn(2, len(frames), 8)
+    told[:, 3] = th.as_tensor(step) / 5
+    train, test = (PlayedFrames(episode[rows], step[rows], frames.quantity[rows]) for rows in (slice(400), slice(400, None)))
+
+    def accuracy(features, sham=False):
+        head = PartialOrder(8, 1, pairing="paper", order_head="difference")
+        train_head(head, features[:400], *pairs_within_episodes(train, [1]), sham=sham)
+        return measure_controls(test, *judgement(head, features[400:]), k=1).pair_accuracy
+
+    assert accuracy(told) > 0.9
+    assert accuracy(untold) == pytest.approx(0.5, abs=0.12)
+    assert accuracy(told, sham=True) == pytest.approx(0.5, abs=0.25)
+
+
+def test_a_head_is_judged_as_in_training(model):
+    features = th.randn(40, model.policy.objective.features_dim)
+    first, second = np.arange(20), np.arange(20, 40)
+    objective = PartialOrder(features.shape[1], 2, pairing="paper")
+    logged = objective.loss(EncodedBatch(present=features[:20], future=features[20:]))[1]["accuracy"]
+    assert judgement(objective, features)[1](first, second).mean() == pytest.approx(float(logged))
 
 
 def test_diagnosis_leaves_the_model_as_it_was(model):
@@ -120,8 +168,9 @@ def test_runs_become_a_table_of_what_their_classifiers_learned(model_file, tmp_p
     table = diagnose_runs([tmp_path], n_episodes=1)
     assert table[["env", "algo", "seed", "step"]].to_numpy().tolist() == [["FallingBall-v0", "mine", 3, 80]]
     expected = diagnose(load_model(run / "FallingBall-v0.zip"), "FallingBall-v0", n_episodes=1)
-    assert (table["leak_loss"].item(), table["correlation"].item()) == (expected.leak_loss, expected.correlation)
+    assert (table["leak_loss"].item(), table["correlation"].item()) == (expected.leak_loss, expected.orders["own"].correlation)
     assert main(["diagnose", str(tmp_path), "-n", "1", "--csv", str(tmp_path / "table.csv")]) == 0
+    assert {"clock_correlation", "partial_correlation", "equal_time_accuracy"} < set(table.columns)
     assert "mine" in capsys.readouterr().out and (tmp_path / "table.csv").read_text().startswith("env,algo,seed,step,loss,")
     with pytest.raises(UserError, match="none of these runs has ended with a model that learns an order"):
         diagnose_runs([other])

@@ -1,10 +1,10 @@
 """
-Fills in the tables of results.md, full_speed.md, trials.md and por.md from the tables in results/, and draws their figures.
+Fill in the tables of results.md, full_speed.md, trials.md and por.md from results/, and draw their figures.
 
     python docs/_scripts/make_results.py              tables only
     python docs/_scripts/make_results.py --figures    and the figures
 
-A table stands between `<!-- table: NAME -->` and `<!-- end -->`; ``TABLES`` has what makes each.
+A table stands between `<!-- table: NAME -->` and `<!-- end -->`; ``TABLES`` maps its name to a function.
 """
 
 import argparse
@@ -22,9 +22,9 @@ DOCS = Path(__file__).parents[1]
 RESULTS = DOCS.parent / "results"
 PAGES = ("results.md", "lab/full_speed.md", "lab/trials.md", "por.md")
 METRIC = "normalized_performance"
-#: Whom the paper compares POR with, from pixels.
+#: POR's rivals from pixels in the paper.
 RIVALS = ("sac_drq", "sac_curl", "sac_spr")
-#: Task -> mean score that SAC is to reach from the state, and within how many steps.
+#: Task -> target mean score of SAC on the state, and the steps to reach it in.
 WANTED = {
     "PourWater-v0": (0.8, 100_000),
     "PourWaterAmount-v0": (0.7, 100_000),
@@ -33,12 +33,20 @@ WANTED = {
     "DropFoldCloth-v0": (0.5, 300_000),
 }
 
+#: Correlations in a table of diagnoses -> their titles. Tables from before the controls have the first alone.
+CORRELATIONS = {
+    "correlation": "correlation",
+    "clock_correlation": "of the clock",
+    "partial_correlation": "given time",
+    "equal_time_correlation": "at equal time",
+}
+
 
 def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table in Markdown."""
+    """Format a table in Markdown."""
     lines = [tuple(head), *map(tuple, rows)]
     if len({len(line) for line in lines}) > 1:
-        raise ValueError(f"a row has not as many cells as the head, {lines[0]}")
+        raise ValueError(f"a row has another number of cells than the head, {lines[0]}")
     lines.insert(1, ("---",) * len(lines[0]))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -49,7 +57,7 @@ def with_interval(value: float, low: float, high: float) -> str:
 
 
 def comparison(suite: str) -> str:
-    """Every method on pouring: score, ratio to the best rival, whether POR is better, time."""
+    """Tabulate all methods of a suite: score, ratio to the best rival, probability that POR is better, time."""
     scores = read_scores([RESULTS / suite / "scores.csv"])
     tables = {kind: plot(scores, kind)[0].table for kind in ("aggregates", "ratio", "improvement")}
     means = tables["aggregates"].query("statistic == 'mean'").set_index("algo").sort_values("value", ascending=False)
@@ -78,7 +86,7 @@ def comparison(suite: str) -> str:
 
 
 def rivals() -> str:
-    """The plain learner and POR beside those that the paper compares with."""
+    """Tabulate POR and its ablation lambda = 0 against the paper's rivals."""
     scores = read_scores([RESULTS / "main" / "scores.csv"])
     rows = []
     for algo in ("sac_por", "por_lambda_0"):
@@ -89,7 +97,7 @@ def rivals() -> str:
 
 
 def weights() -> str:
-    """POR by pairing and weight: each seed on the way, and at the end of `full_speed`."""
+    """Tabulate POR by pairing and weight: each seed at two steps, and the mean at the second."""
     scores = pd.concat(read_scores([RESULTS / suite / "scores.csv"]) for suite in ("full_speed", "weights"))
     runs = scores.sort_values("seed").groupby(["algo", "step"])[METRIC]
     rows = []
@@ -106,7 +114,7 @@ def weights() -> str:
 
 
 def courses(suite: str) -> str:
-    """A few runs, each by itself: where it was best, and where it ended."""
+    """Tabulate single runs: best evaluation, mean of the last four, last evaluation."""
     scores = read_scores([RESULTS / suite / "scores.csv"])
     rows = []
     for (algo, seed), run in scores.groupby(["algo", "seed"]):
@@ -125,7 +133,7 @@ def courses(suite: str) -> str:
 
 
 def evaluations(folder: str) -> str:
-    """Single runs: every evaluation."""
+    """Tabulate every evaluation of single runs."""
     scores = read_scores([RESULTS / folder / "scores.csv"])
     rows = []
     for (env_id, name, seed), run in scores.groupby(["env", "algo", "seed"]):
@@ -136,7 +144,7 @@ def evaluations(folder: str) -> str:
 
 
 def state() -> str:
-    """What SAC has reached from the state."""
+    """Tabulate the best scores of SAC on the state against their targets."""
     scores = read_scores([RESULTS / "state" / "scores.csv"])
     rows = []
     for env_id, (wanted, within) in WANTED.items():
@@ -157,8 +165,9 @@ def state() -> str:
 
 
 def diagnosis(suite: str) -> str:
-    """What the classifiers of the comparison have learned."""
+    """Tabulate the diagnoses of a suite's models, with the controls that its table has."""
     table = pd.read_csv(RESULTS / suite / "diagnosis.csv")
+    correlations = {name: title for name, title in CORRELATIONS.items() if name in table}
     rows = [
         (
             f"`{row.algo}`",
@@ -166,7 +175,7 @@ def diagnosis(suite: str) -> str:
             *(f"{value:.3f}" for value in (row.accuracy, row.random_accuracy, row.leak_accuracy)),
             *(f"{value:.2g}" if value < 1 else f"{value:.0f}" for value in (row.grad_norm_critic, row.grad_norm_por)),
             f"{row.feature_std:.3f}",
-            "-" if pd.isna(row.correlation) else f"{row.correlation:.2f}",
+            *("-" if pd.isna(value) else f"{value:.2f}" for value in (getattr(row, name) for name in correlations)),
         )
         for row in table.sort_values(["algo", "seed"], ascending=[False, True]).itertuples()
     ]
@@ -179,13 +188,13 @@ def diagnosis(suite: str) -> str:
         "gradient of the critic",
         "of λ POR",
         "std of features",
-        "correlation",
+        *correlations.values(),
     )
     return markdown(head, rows)
 
 
 def leak() -> str:
-    """Both pairings where the answer is known: means over the last hundred updates."""
+    """Tabulate both pairings where the answer is known: means over the last hundred updates."""
     table = pd.read_csv(RESULTS / "leak" / "leak.csv")
     last = table.sort_values("update").groupby(["env", "pairing"]).last()
     names = {
@@ -226,7 +235,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def fill_in(page: str) -> str:
-    """A page with its tables as they follow from the results."""
+    """Replace a page's tables by those that follow from the results."""
     return re.sub(
         r"(<!-- table: (\w+) -->\n).*?(?=<!-- end -->)",
         lambda match: f"{match[1]}\n{TABLES[match[2]]()}\n\n",
@@ -236,7 +245,7 @@ def fill_in(page: str) -> str:
 
 
 def draw() -> None:
-    """The figures of scores and of order."""
+    """Draw the figures of scores and of POR's classifier."""
     for suite in ("main", "full_speed", "weights", "long", "steady", "rope", "fold", "state"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
@@ -245,7 +254,7 @@ def draw() -> None:
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Parse the command line, fill in the pages, draw the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--figures", action="store_true", help="draw the figures, too")
     if parser.parse_args().figures:

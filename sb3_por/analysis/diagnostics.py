@@ -20,7 +20,7 @@ from sb3_por.evaluation.evaluate import EnvWrapper, make_evaluation_env
 from sb3_por.evaluation.loading import find_environment, load_model, trained_in
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.runs.facts import run_identity
-from sb3_por.runs.folder import find_runs, is_finished
+from sb3_por.runs.folder import find_runs, is_finished, last_model
 
 #: Pairs in a batch, and number of batches that a metric is averaged over.
 BATCH_SIZE, N_BATCHES = 256, 4
@@ -208,7 +208,7 @@ def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int 
     rows = []
     for run in find_runs(folders):
         identity = run_identity(run)
-        file = run / f"{identity['env']}.zip"
+        file = run / last_model(identity["env"])
         if not is_finished(run, identity["env"]):
             continue
         find_environment(identity["env"], file)

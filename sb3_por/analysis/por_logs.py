@@ -13,7 +13,7 @@ from sb3_por.analysis.scores import RUN_KEYS, join_runs
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.files import atomic_write
 from sb3_por.runs.facts import run_identity
-from sb3_por.runs.folder import find_runs, read_evaluations, run_arguments
+from sb3_por.runs.folder import ARGUMENTS, TENSORBOARD, find_runs, read_evaluations, run_arguments
 
 #: Chance is ln 2 for losses and 0.5 for accuracies. The leak control (k = 0) must stay there.
 CLASSIFIER_METRICS = ["por_loss", "por_accuracy", "por_leak_loss", "por_leak_accuracy"]
@@ -84,13 +84,13 @@ def _logs_of(run: Path) -> list[EventAccumulator]:
     The TensorBoard logs of a run: those in its ``tb/``, and those in the ``tensorboard_log`` that ``args.yml`` names
     (``train.py -tb DIR`` and ``--track``). Runs may share that folder, so its logs must agree with the run's evaluations.
     """
-    own = _open_logs(run / "tb")
+    own = _open_logs(run / TENSORBOARD)
     shared = run_arguments(run).get("tensorboard_log")
     if not shared:
         if not own:
-            raise NoLogs(f"there are no TensorBoard files in {run / 'tb'}")
+            raise NoLogs(f"there are no TensorBoard files in {run / TENSORBOARD}")
         return own
-    settings = next(run.glob("*/args.yml")).parent
+    settings = next(run.glob(f"*/{ARGUMENTS}")).parent
     folder = _started_in(run) / shared / settings.name
     arrays = read_evaluations(run)
     evaluations = dict(zip(arrays["timesteps"].tolist(), arrays["results"].mean(axis=1).tolist(), strict=True))

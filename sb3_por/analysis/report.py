@@ -1,4 +1,4 @@
-"""One page that holds everything a set of runs has shown: it needs no network, no scripts and no other file."""
+"""A self-contained HTML page about a set of runs: no network, no scripts, no other file."""
 
 import base64
 import mimetypes
@@ -24,26 +24,28 @@ from sb3_por.common.files import atomic_write, check_writable
 from sb3_por.evaluation.loading import LOADABLE, find_environment, load_model, trained_in
 from sb3_por.evaluation.video import record_video
 from sb3_por.runs.facts import RunFacts, orphaned_logs, take_inventory
-from sb3_por.runs.folder import EVALUATIONS
+from sb3_por.runs.folder import BEST_MODEL, EVALUATIONS
 
 PAGE = "index.html"
 FIGURES = "figures"
 TEMPLATE = "report.html.jinja"
-#: Printed where there is no number.
+#: Cell of a table without a number.
 NOTHING = "-"
 #: Height and width of the videos: small, since a page holds one for each task and algorithm.
 VIDEO_SIZE = 200
-#: Of tables that hold curves the page shows each curve's end; these columns name the curve. The whole is in the .csv.
+#: Tables of curves, and the columns that name a curve. The page shows the last row of each curve, the ``.csv`` all rows.
 CURVES = {"iqm": ["algo"], "tasks": ["env", "algo"], "order": ["env", "algo", "metric"]}
-#: Tables that a reader has nothing of.
+#: Tables too long to print.
 UNREADABLE = ("profile",)
 
 
 @dataclass(frozen=True)
 class Picture:
     """
-    :param title: what it shows, in words
-    :param uri: the image itself, as a data URI
+    A picture on the page.
+
+    :param title: its caption
+    :param uri: the image as a data URI
     """
 
     title: str
@@ -55,11 +57,11 @@ class Section:
     """
     A figure on the page.
 
-    :param title: the question it answers
-    :param name: its file's
+    :param title: the question that it answers
+    :param name: name of its file
     :param picture: the figure
-    :param header: of the table under it; no table if empty
-    :param rows: of that table, as it is printed
+    :param header: header of the table below it; empty for no table
+    :param rows: printed rows of that table
     """
 
     title: str
@@ -78,13 +80,14 @@ def write_report(
     videos: bool = True,
 ) -> Path:
     """
+    Write a page about runs.
+
     :param paths: run folders, folders that hold runs at any depth, and tables of scores (``.csv``), in any mixture
-    :param folder: gets ``index.html``, which stands by itself, and ``figures/`` with the same figures for print and their
-        numbers
-    :param metric: what to compare; by default the first of ``METRICS`` that is recorded
+    :param folder: folder for ``index.html`` and for ``figures/``, the same figures for print with their numbers
+    :param metric: score to compare; by default the first of ``METRICS`` that is recorded
     :param step: see :func:`sb3_por.analysis.learning_curves.read_grid`
-    :param seed: of the bootstrap
-    :param videos: play the best models, and draw what their classifiers look at, which takes some seconds each
+    :param seed: seed of the bootstrap
+    :param videos: record videos and saliency maps of the best models, a few seconds each
     :return: the page
     :raises UserError: if there is neither a run nor a score
     """
@@ -104,7 +107,7 @@ def write_report(
     shown: dict[str, list[Picture]] = {}
     notes: list[str] = []
     if not runs:
-        notes.append("made from scores alone: only run folders tell settings, machines and failures, and hold models")
+        notes.append("made from scores alone: settings, machines, failures and videos need run folders")
     if scores is None:
         notes.append("no run was evaluated: there is nothing to plot")
     else:
@@ -158,7 +161,10 @@ def _template() -> jinja2.Template:
 
 def _section(plot: Plot, figures: Path) -> Section:
     """
-    :param figures: where the figure was saved
+    Make the section of a figure.
+
+    :param plot: the figure and its numbers
+    :param figures: folder where the figure was saved
     """
     table = plot.table
     if plot.name in CURVES:
@@ -171,7 +177,7 @@ def _section(plot: Plot, figures: Path) -> Section:
 
 
 def _run_row(run: RunFacts, scores: pd.DataFrame | None, metric: str | None) -> dict[str, str]:
-    """What the table of runs says of one."""
+    """One row of the table of runs."""
     row = {
         "algorithm": run.algo,
         "environment": run.env,
@@ -195,7 +201,7 @@ def _run_row(run: RunFacts, scores: pd.DataFrame | None, metric: str | None) -> 
 
 
 def _settings(runs: list[RunFacts]) -> list[dict[str, Any]]:
-    """The runs that share all their settings, and these."""
+    """Group the runs that share all settings."""
     groups: dict[tuple[str, str, str], list[RunFacts]] = {}
     for run in runs:
         groups.setdefault((run.env, run.algo, repr(sorted(run.settings.items(), key=str))), []).append(run)
@@ -209,8 +215,8 @@ def _settings(runs: list[RunFacts]) -> list[dict[str, Any]]:
 
 
 def _best_runs(runs: list[RunFacts], scores: pd.DataFrame, metric: str) -> Iterator[tuple[str, str, RunFacts, float]]:
-    """Of each task and algorithm the run with the best evaluation among those that have kept a model."""
-    with_model = [run for run in runs if (run.folder / "best_model.zip").is_file()]
+    """The run with the best evaluation for each task and algorithm, among runs with a saved model."""
+    with_model = [run for run in runs if (run.folder / BEST_MODEL).is_file()]
     for env in sorted({run.env for run in with_model}):
         for algo in sort_algos(run.algo for run in with_model if run.env == env):
             members = [run for run in with_model if (run.env, run.algo) == (env, algo)]
@@ -221,8 +227,12 @@ def _best_runs(runs: list[RunFacts], scores: pd.DataFrame, metric: str) -> Itera
 
 def _show_models(best: Iterator[tuple[str, str, RunFacts, float]], notes: list[str]) -> dict[str, list[Picture]]:
     """
-    Task -> a video of each algorithm's best model, followed by its saliency map if it learns an order from images. What
-    cannot be shown is noted: a page about many runs is not to fail with one of them.
+    Record a video of each algorithm's best model, and a saliency map if it learns an order from images. A model that cannot
+    be shown gets a note, so one broken run does not stop the page.
+
+    :param best: task, algorithm, run, score
+    :param notes: the list for the notes
+    :return: task -> pictures
     """
     shown: dict[str, list[Picture]] = {}
     for env, algo, run, score in best:
@@ -238,10 +248,10 @@ def _show_models(best: Iterator[tuple[str, str, RunFacts, float]], notes: list[s
                 if _learns_order(model):
                     path = Path(folder) / "saliency.png"
                     frame = draw_saliency(model, env, path, **environment)
-                    title = f"{algo}, seed {run.seed}: what its classifier looks at in frame {frame}"
+                    title = f"{algo}, seed {run.seed}: saliency of its classifier in frame {frame}"
                     shown[env].append(_picture(title, path))
             except UserError as error:
-                notes.append(f"{run.name}: not everything can be shown of its model: {error}")
+                notes.append(f"{run.name}: its model cannot be shown: {error}")
     return shown
 
 
@@ -263,7 +273,7 @@ def _picture(title: str, path: Path) -> Picture:
 
 
 def _printed(value: Any) -> str:
-    """As the page prints a cell."""
+    """A cell as the page prints it."""
     if not isinstance(value, float | np.floating):
         return str(value)
     if np.isnan(value):

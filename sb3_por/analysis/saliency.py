@@ -1,4 +1,4 @@
-"""Which pixels the partial-order classifier looks at: the paper's Figure 7, through captum."""
+"""Saliency maps of POR's classifier (the paper's Figure 7), computed by captum."""
 
 from pathlib import Path
 from typing import Any
@@ -16,20 +16,20 @@ from sb3_por.evaluation.episodes import evaluation_episodes
 from sb3_por.evaluation.evaluate import EnvWrapper, make_evaluation_env
 
 FORMATS = (".png", ".jpg")
-#: SmoothGrad: gradients are averaged over this many noisy copies, with noise of this standard deviation (grey levels).
+#: SmoothGrad: number of noisy copies that gradients are averaged over, and standard deviation of the noise (grey levels).
 N_SAMPLES, NOISE = 25, 8.0
-#: Height and width of each of the pictures, pixels.
+#: Height and width of each picture, pixels.
 SIZE = 480
 
 
 def saliency_map(model: Any, earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
     """
-    How much each pixel of the later frame moves the classifier's belief that it is the later one: the absolute gradient
-    of the logits (SmoothGrad of https://arxiv.org/abs/1706.03825), the largest over the colours.
+    Compute the influence of each pixel of the later frame on the classifier's belief that this frame is the later one:
+    the absolute gradient of the logits (SmoothGrad, https://arxiv.org/abs/1706.03825), maximum over the colours.
 
     :param model: trained with a ``PartialOrder`` objective on images
     :param earlier: uint8, ``(channels, height, width)``
-    :param later: the same
+    :param later: uint8, same shape
     :return: float32 ``(height, width)``, from 0 to 1
     """
     objective = check_order(model)
@@ -51,10 +51,12 @@ def saliency_map(model: Any, earlier: np.ndarray, later: np.ndarray) -> np.ndarr
 
 def overlay(frame: np.ndarray, heat: np.ndarray, size: int = SIZE) -> np.ndarray:
     """
+    Draw a saliency map over its frame.
+
     :param frame: RGB, uint8 ``(height, width, 3)``
-    :param heat: ``(height, width)`` in [0, 1]
-    :param size: of each picture
-    :return: the frame, and beside it the frame in grey under the heat; uint8 ``(size, 2 * size, 3)``
+    :param heat: saliency map, ``(height, width)`` in [0, 1]
+    :param size: height and width of each picture
+    :return: the frame, and beside it the frame in grey under the map; uint8 ``(size, 2 * size, 3)``
     """
     frame = cv2.resize(frame, (size, size), interpolation=cv2.INTER_NEAREST)
     heat = cv2.resize(heat.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC).clip(0, 1)
@@ -74,23 +76,23 @@ def draw_saliency(
     env_wrapper: EnvWrapper | None = None,
 ) -> int:
     """
-    Play the first held-out episode, and draw what the classifier looks at in one of its frames.
+    Play the first held-out episode, and draw the saliency map of one of its frames.
 
     :param model: trained with a ``PartialOrder`` objective on images
     :param env_id: a Gymnasium id
     :param path: ``.png`` or ``.jpg``
-    :param step: number of the later frame; by default where ``info["monotone"]`` rises most
-    :param seed: of the episode
-    :param env_kwargs: for the environment's constructor
-    :param vec_normalize: file of ``VecNormalize`` statistics that the model was trained with
-    :param env_wrapper: what the model was trained inside
-    :return: the step that was drawn
+    :param step: number of the later frame; by default the one with the largest rise of ``info["monotone"]``
+    :param seed: seed of the episode
+    :param env_kwargs: arguments of the environment's constructor
+    :param vec_normalize: file of the ``VecNormalize`` statistics from training
+    :param env_wrapper: the wrappers from training
+    :return: number of the drawn frame
     :raises UserError: if the model learns no order from images, or there is no such step
     """
     _, k = check_order(model).future or (1, 1)
     path = check_output(path, FORMATS)
     if not isinstance(model.observation_space, spaces.Box) or len(model.observation_space.shape) != 3:
-        raise UserError(f"a saliency map needs a model that sees images alone, not {model.observation_space}")
+        raise UserError(f"a saliency map needs a model that observes images alone, not {model.observation_space}")
     env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize, env_wrapper)
     try:
         env.env_method("play", evaluation_episodes(env_id, 1, seed))

@@ -1,4 +1,4 @@
-"""The table of scores: one row an evaluation, read from runs or from ``scores.csv``."""
+"""The table of scores: one row for each evaluation, read from runs or from ``scores.csv``."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +11,7 @@ from sb3_por.common.files import atomic_write
 from sb3_por.runs.facts import run_identity
 from sb3_por.runs.folder import find_runs, read_evaluations, run_arguments
 
-#: What identifies a run, and what an evaluation measures.
+#: Columns that identify a run, and columns that an evaluation measures.
 RUN_KEYS = ["env", "algo", "seed"]
 METRICS = ["normalized_performance", "return", "success"]
 COLUMNS = [*RUN_KEYS, "step", *METRICS, "wall_clock_s", "commit"]
@@ -19,8 +19,10 @@ COLUMNS = [*RUN_KEYS, "step", *METRICS, "wall_clock_s", "commit"]
 
 def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
     """
+    Read the scores of many runs.
+
     :param paths: run folders, folders that hold runs at any depth, and ``.csv`` files of scores, in any mixture
-    :return: one row an evaluation with the columns ``COLUMNS``, sorted; a metric that was not recorded is NaN
+    :return: one row for each evaluation with the columns ``COLUMNS``, sorted; a metric that was not recorded is NaN
     :raises UserError: if a path holds no scores, or two runs of one algorithm and environment have one seed
     """
     given = [Path(path) for path in paths]
@@ -32,8 +34,10 @@ def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
 
 def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:
     """
-    :param tables: with the columns ``RUN_KEYS`` and step, at least one table; a run is in one of them
-    :return: all their rows, sorted
+    Join tables of different runs.
+
+    :param tables: at least one table, with the columns ``RUN_KEYS`` and step; each run stands in a single table
+    :return: all rows, sorted
     :raises UserError: if two runs of one algorithm and environment have one seed
     """
     rows = pd.concat(tables, ignore_index=True)
@@ -42,7 +46,7 @@ def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:
     if len(doubled):
         env, algo, seed = doubled.iloc[0][RUN_KEYS]
         raise UserError(
-            f"there are two runs of {algo} on {env} with seed {seed}; give one of them, or tell them apart: train.py --label "
+            f"there are two runs of {algo} on {env} with seed {seed}; give one of them, or label them: train.py --label "
             "NAME, or label: NAME in the run's args.yml"
         )
     return rows.sort_values([*RUN_KEYS, "step"], kind="stable", ignore_index=True)
@@ -50,8 +54,10 @@ def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:
 
 def read_run(run: Path) -> pd.DataFrame:
     """
-    :param run: a run folder; what its settings do not say is read from its path, ``<algo>/<env>_<n>``
-    :return: its rows of the table of scores; means over the episodes of each evaluation
+    Read the scores of one run.
+
+    :param run: a run folder; identity missing in its settings is read from its path, ``<algo>/<env>_<n>``
+    :return: its rows of the table of scores, means over the episodes of each evaluation
     :raises UserError: if its evaluations cannot be read
     """
     arrays = read_evaluations(run)
@@ -73,7 +79,10 @@ def read_run(run: Path) -> pd.DataFrame:
 
 def read_csv(path: Path) -> pd.DataFrame:
     """
+    Read a table of scores.
+
     :param path: a file that :func:`write_csv` wrote, or one with its columns
+    :return: the table
     :raises UserError: if it cannot be read or lacks a column
     """
     try:

@@ -1,4 +1,4 @@
-"""The ends of the scale as models: policies that do nothing or act at random, and the scripted expert of a task."""
+"""Reference policies: random, do-nothing and the scripted expert."""
 
 from typing import Any
 
@@ -12,10 +12,10 @@ from softbody_envs.registration import ENV_IDS
 
 class RandomModel:
     """
-    Acts uniformly at random.
+    Policy with uniformly random actions.
 
     :param env_id: a Gymnasium id
-    :param seed: of the actions
+    :param seed: seed of the actions
     """
 
     def __init__(self, env_id: str, seed: int = 0) -> None:
@@ -25,13 +25,13 @@ class RandomModel:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
-        """One action for each of the observations."""
+        """Sample one action for each observation."""
         return np.stack([self.action_space.sample() for _ in observation]), state
 
 
 class IdleModel:
     """
-    Does nothing: the middle of every action's range.
+    Policy that does nothing: the middle of every action's range.
 
     :param env_id: a Gymnasium id with a ``Box`` action space
     """
@@ -39,20 +39,20 @@ class IdleModel:
     def __init__(self, env_id: str) -> None:
         self.observation_space, self.action_space = _spaces(env_id)
         if not isinstance(self.action_space, gym.spaces.Box):
-            raise UserError(f"{env_id} has no middle of its actions, {self.action_space}, to do nothing with")
+            raise UserError(f"{env_id} has no action that does nothing: its action space is {self.action_space}, not a Box")
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
-        """The same action for each of the observations."""
+        """Return the same action for each observation."""
         return np.stack([(self.action_space.low + self.action_space.high) / 2 for _ in observation]), state
 
 
 class ExpertModel:
     """
-    Acts as the scripted expert of a task: the ceiling that a learner is measured against.
+    Policy of a task's scripted expert.
 
-    :param env_id: one of our environments
+    :param env_id: id of a task with an expert
     """
 
     def __init__(self, env_id: str) -> None:
@@ -64,7 +64,7 @@ class ExpertModel:
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
-        """One action for each of the state vectors."""
+        """Return the expert's action for each state vector."""
         if len(self._experts) != len(observation):
             self._experts = [self._make_expert() for _ in observation]
         starts = np.zeros(len(observation), dtype=bool) if episode_start is None else episode_start
@@ -74,7 +74,7 @@ class ExpertModel:
         return np.stack([expert.act(vector) for expert, vector in zip(self._experts, observation, strict=True)]), state
 
 
-#: What ``--model`` takes besides files.
+#: Names that ``--model`` accepts instead of a file.
 REFERENCES = {"random": RandomModel, "nothing": IdleModel, "expert": ExpertModel}
 
 

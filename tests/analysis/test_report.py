@@ -132,7 +132,7 @@ def test_the_page_shows_what_failed(page):
     assert "<p>4 runs, 12 evaluations." in page.source and "2 not finished" in page.source
     assert f"sac on {ENV}, seed 1: stopped at step 300 of 300" in page.source
     assert "line 99\nKilled: &lt;b&gt;out of memory&lt;/b&gt;" in page.source and "line 10\n" not in page.source
-    assert "seed_2/log.txt: failed before it began" in page.source and "error: no such setting" in page.source
+    assert "seed_2/log.txt: failed before the run started" in page.source and "error: no such setting" in page.source
 
 
 def test_the_page_shows_the_best_models(page):
@@ -141,7 +141,7 @@ def test_the_page_shows_the_best_models(page):
     assert len(shown) == 3 and {video, f"{ENV}, sac, seed 0: best of its evaluations 0.600"} < set(shown)
     kind, moving = shown[video]
     assert kind == "data:image/gif" and moving.n_frames > 1
-    (saliency,) = [picture for alt, picture in shown.items() if "what its classifier looks at" in alt]
+    (saliency,) = [picture for alt, picture in shown.items() if "saliency of its classifier" in alt]
     assert saliency[0] == "data:image/png"
 
 
@@ -168,7 +168,7 @@ def test_a_corrupt_model_is_noted_and_the_page_written(tmp_path):
     run = write_run(tmp_path)
     (run / "best_model.zip").write_bytes(b"PK nonsense")
     page = Page(write_report([run], tmp_path / "page"))
-    assert "not everything can be shown of its model" in page.source and "is corrupt" in page.source
+    assert "its model cannot be shown" in page.source and "is corrupt" in page.source
 
 
 def test_a_run_at_work_is_no_failure_yet(tmp_path):

@@ -81,7 +81,7 @@ def test_report_writes_a_page_and_says_where(run, tmp_path, capsys):
     assert main(["report", str(run), "-o", str(tmp_path / "page"), "--no-videos"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'page' / 'index.html'}\n"
     page = (tmp_path / "page" / "index.html").read_text()
-    assert "Pendulum-v1" in page and 'id="videos"' not in page and "not everything can be shown of its model" not in page
+    assert "Pendulum-v1" in page and 'id="videos"' not in page and "its model cannot be shown" not in page
 
 
 def test_plot_draws_a_run_and_its_table_draws_the_same(run, tmp_path, capsys):

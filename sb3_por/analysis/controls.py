@@ -147,12 +147,12 @@ def pairs_at_equal_time(frames: PlayedFrames) -> tuple[np.ndarray, np.ndarray]:
 
     :return: indices of the frames with the smaller quantity, and of those with the larger
     """
-    smaller, larger = [np.empty(0, int)], [np.empty(0, int)]
+    pairs: list[np.ndarray] = [np.empty((2, 0), int)]
     for rows in _groups(frames.step):
-        first, second = (rows[i] for i in np.nonzero(frames.quantity[rows][None] - frames.quantity[rows][:, None] > TOLERANCE))
-        smaller.append(first)
-        larger.append(second)
-    return np.concatenate(smaller), np.concatenate(larger)
+        quantity = frames.quantity[rows]
+        pairs.append(rows[np.array(np.nonzero(quantity - quantity[:, None] > TOLERANCE))])
+    smaller, larger = np.concatenate(pairs, axis=1)
+    return smaller, larger
 
 
 def spearman(potential: np.ndarray, quantity: np.ndarray) -> float:

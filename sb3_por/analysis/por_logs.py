@@ -128,8 +128,9 @@ def _evaluations(log: EventAccumulator) -> dict[int, float]:
 
 def _agrees(log: EventAccumulator, evaluations: dict[int, float]) -> bool:
     """Whether a log has evaluations of a run, and none that differs from the run's."""
-    both = [(value, evaluations[step]) for step, value in _evaluations(log).items() if step in evaluations]
-    return bool(both) and bool(np.allclose(*zip(*both, strict=True), rtol=1e-5))  # TensorBoard keeps float32
+    logged = {step: value for step, value in _evaluations(log).items() if step in evaluations}
+    own = [evaluations[step] for step in logged]
+    return bool(logged) and np.allclose(list(logged.values()), own, rtol=1e-5)  # TensorBoard keeps float32
 
 
 def _latest(events: list[tuple[float, int, float]]) -> pd.Series:

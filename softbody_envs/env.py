@@ -36,6 +36,10 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1 / CONTROL_PERIOD}  # noqa: RUF012
 
+    #: Seeds the variations, with their index. Subclasses inherit it: the same task with another reward has the same scenes.
+    scenes: ClassVar[str]
+    #: Entry point, "module:class", of the scripted expert, if there is one.
+    expert: ClassVar[str | None] = None
     #: What the images show.
     camera: ClassVar[Camera]
     #: Number of elements of an action.
@@ -143,7 +147,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
             self._world = self._open()
         self._faulty = False
         self.world.clear()
-        self._build(self.world, variation_rng(type(self).__name__, self.variation))
+        self._build(self.world, variation_rng(self.scenes, self.variation))
         self._initial_performance = self.performance()
         observation, _, info = self._outcome()
         return observation, info

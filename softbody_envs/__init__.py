@@ -2,10 +2,10 @@
 
 import sys
 
-from softbody_envs.sim.quiet import quiet
+from softbody_envs.sim.banner import no_banner
 
 try:
-    with quiet():
+    with no_banner():
         import pybullet
 except ImportError as error:  # pragma: no cover - depends on the machine
     raise ImportError(

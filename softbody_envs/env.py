@@ -11,6 +11,7 @@ from gymnasium.utils import EzPickle
 from softbody_envs.rendering import Camera, Renderer
 from softbody_envs.sim.world import CONTROL_PERIOD, World
 from softbody_envs.variations import SPLITS, check_variation, variation_rng
+from softbody_envs.window import Window
 
 OBS_TYPES = ("pixels", "state", "dict")
 #: Bound of every element of a state vector, in the units of its task's page; a value beyond it is clipped.
@@ -30,12 +31,17 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
     :param image_size: height and width of the observed image, pixels
     :param split: ``"train"`` (variations 0-799) or ``"eval"`` (800-999): what ``reset`` draws from
     :param renderer: ``"tiny"`` (any machine) or ``"egl"`` (graphics driver)
-    :param render_mode: ``None`` or ``"rgb_array"``
-    :param render_size: height and width of what ``render`` returns, pixels
+    :param render_mode: ``None``, ``"rgb_array"`` (``render`` returns an image) or ``"human"`` (a window shows every step in
+        real time; needs the extra ``human``)
+    :param render_size: height and width of the rendered image, pixels
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1 / CONTROL_PERIOD}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 1 / CONTROL_PERIOD}  # noqa: RUF012
 
+    #: Seeds the variations, with their index. Subclasses inherit it: the same task with another reward has the same scenes.
+    scenes: ClassVar[str]
+    #: Entry point, "module:class", of the scripted expert, if there is one.
+    expert: ClassVar[str | None] = None
     #: What the images show.
     camera: ClassVar[Camera]
     #: Number of elements of an action.
@@ -65,13 +71,14 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         if split not in SPLITS:
             raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+            raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
         self.obs_type = obs_type
         self.image_size = image_size
         self.split = split
         self.render_mode = render_mode
         self.render_size = render_size
         self.renderer = Renderer(renderer)
+        self._window = Window(self.metadata["render_fps"]) if render_mode == "human" else None
 
         image = gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
         state = gym.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (len(self.state_names),), np.float32)
@@ -143,9 +150,11 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
             self._world = self._open()
         self._faulty = False
         self.world.clear()
-        self._build(self.world, variation_rng(type(self).__name__, self.variation))
+        self._build(self.world, variation_rng(self.scenes, self.variation))
         self._initial_performance = self.performance()
         observation, _, info = self._outcome()
+        if self._window is not None:
+            self.render()
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -162,30 +171,43 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         if not np.isfinite(action).all():
             raise ValueError(f"action must be finite, got {action}")
         self._control(np.clip(action, -1.0, 1.0))
-        if fault := self.fault():
+        fault = self.fault()
+        if fault is None:
+            observation, reward, info = self._outcome()
+        else:
             # Positions mean nothing any more: repeat the last sound step, end the episode, and start the next one
             # from a fresh client.
-            self.close()
+            self._disconnect()
             self._faulty = True
             observation, reward, info = self._last_sound
-            return observation, reward, False, True, info | {"sim_error": fault}
-        observation, reward, info = self._outcome()
-        return observation, reward, False, False, info
+            info = info | {"sim_error": fault}
+        if self._window is not None:
+            self.render()
+        return observation, reward, False, fault is not None, info
 
     def render(self) -> np.ndarray | None:
         """
-        An RGB image, uint8 ``(render_size, render_size, 3)``, if ``render_mode`` is ``"rgb_array"``; a black one after a
-        simulation that failed, of which nothing is left to draw.
+        Draw the present state; black after the simulation has failed.
+
+        :return: an RGB image, uint8 ``(render_size, render_size, 3)``, if ``render_mode`` is ``"rgb_array"``
         """
         if self.render_mode is None:
             gym.logger.warn('render() returns nothing: make the environment with render_mode="rgb_array"')
             return None
-        if self._faulty:
-            return np.zeros((self.render_size, self.render_size, 3), np.uint8)
-        return self._image(self.render_size)
+        size = self.render_size
+        frame = np.zeros((size, size, 3), np.uint8) if self._faulty else self._image(size)
+        if self._window is None:
+            return frame
+        self._window.show(frame)
+        return None
 
     def close(self) -> None:
-        """Free the Bullet client; ``reset`` opens a new one."""
+        """Close the window and free the Bullet client; ``reset`` opens new ones."""
+        self._disconnect()
+        if self._window is not None:
+            self._window.close()
+
+    def _disconnect(self) -> None:
         if self._world is not None:
             self._world.close()
             self._world = None

@@ -1,6 +1,12 @@
-"""The table of environment ids."""
+"""The table of environment ids, and the class that an id stands for."""
+
+from importlib import import_module
+from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_id, load_env_creator, parse_env_id
+
+from softbody_envs.env import SoftbodyEnv
 
 #: id -> (module:class under ``softbody_envs.tasks``, horizon in control steps of 0.08 s)
 _TABLE = {
@@ -22,3 +28,41 @@ def register_envs() -> None:
     for env_id, (entry_point, horizon) in _TABLE.items():
         if env_id not in gym.registry:
             gym.register(env_id, entry_point=f"softbody_envs.tasks.{entry_point}", max_episode_steps=horizon)
+
+
+def task_class(env_id: str) -> type[SoftbodyEnv] | None:
+    """
+    Find the task that an id stands for: one of ours, or a variant of a user's own (another id, defaults or subclass).
+
+    :param env_id: registered id, as ``gymnasium.make`` takes it: the module that registers it may stand in front
+        (``"module:Id-v0"``), the version may be left out
+    :return: class of the environment inside all wrappers; ``None`` if there is no such id or it is no task
+    """
+    try:
+        made = _made_class(_find_spec(env_id))
+    except (gym.error.Error, ImportError, AttributeError):  # gymnasium.make explains what is wrong with the id
+        return None
+    return made if issubclass(made, SoftbodyEnv) else None
+
+
+def _find_spec(env_id: str) -> EnvSpec:
+    module, _, env_id = env_id.rpartition(":")
+    if module:
+        import_module(module)
+    namespace, name, version = parse_env_id(env_id)
+    if version is None:
+        version = find_highest_version(namespace, name)
+    return gym.spec(get_env_id(namespace, name, version))
+
+
+def _made_class(spec: EnvSpec) -> type:
+    """Class of what an entry point makes. Functions and wrappers are called to see it."""
+    creator: Any = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+    if isinstance(creator, type) and not issubclass(creator, gym.Wrapper):
+        return creator
+    try:
+        env = creator(**spec.kwargs)
+    except TypeError:  # it needs arguments that the id does not have
+        return object
+    env.close()
+    return type(env.unwrapped)

@@ -20,11 +20,11 @@ def check_variation(index: object) -> int:
     return int(index)
 
 
-def variation_rng(task: str, index: int) -> np.random.Generator:
+def variation_rng(scenes: str, index: int) -> np.random.Generator:
     """
-    The generator that draws everything which differs between the variations of one task.
+    Random generator for everything that differs between the variations of a task.
 
-    :param task: name of the task's class; two tasks share no random numbers
+    :param scenes: ``SoftbodyEnv.scenes``; tasks with different names share no random numbers
     :param index: 0..999
     """
-    return np.random.default_rng([zlib.crc32(task.encode()), index])
+    return np.random.default_rng([zlib.crc32(scenes.encode()), index])

@@ -28,6 +28,8 @@ class ActionRepeat(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Reco
             raise ValueError(f"scale must be above 0 and at most 1, got {scale!r}")
         self.repeat = int(repeat)
         self.scale = scale
+        if "render_fps" in env.metadata:  # whoever records sees one frame per repeated action
+            self.metadata = env.metadata | {"render_fps": env.metadata["render_fps"] / self.repeat}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See ``gymnasium.Env.step``; observation and info are those of the last repetition."""

@@ -1,9 +1,11 @@
-"""Scripted experts, one a task: they see the state vector only and give the ceiling of the scores."""
+"""Scripted experts for the tasks. They act on the state vector and set the ceiling of the scores."""
 
-from importlib import import_module
 from typing import Protocol
 
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
+
+from softbody_envs.registration import ENV_IDS, task_class
 
 
 class Expert(Protocol):
@@ -19,25 +21,22 @@ class Expert(Protocol):
         """
 
 
-#: id -> module:class under ``softbody_envs.experts``
-_TABLE = {
-    "PourWater-v0": "pour_water:PourWaterExpert",
-    "PourWaterAmount-v0": "pour_water:PourWaterAmountExpert",
-    "StraightenRope-v0": "straighten_rope:StraightenRopeExpert",
-    "FoldCloth-v0": "fold_cloth:FoldClothExpert",
-    "DropFoldCloth-v0": "drop_fold_cloth:DropFoldClothExpert",
-}
-
-#: Environments that have an expert.
-EXPERT_IDS = tuple(_TABLE)
+def has_expert(env_id: str) -> bool:
+    """Whether the task behind an id, one of ours or a subclass of it, names an expert."""
+    task = task_class(env_id)
+    return task is not None and task.expert is not None
 
 
 def make_expert(env_id: str) -> Expert:
     """
-    :param env_id: an id of ``softbody_envs.ENV_IDS`` that has an expert
+    :param env_id: id of a task that has an expert: one of ours, or one registered for the same class or a subclass of it
     :raises ValueError: if it has none
     """
-    if env_id not in _TABLE:
-        raise ValueError(f"no expert for {env_id!r}; there is one for {', '.join(_TABLE)}")
-    module, name = _TABLE[env_id].split(":")
-    return getattr(import_module(f"softbody_envs.experts.{module}"), name)()
+    task = task_class(env_id)
+    if task is None or task.expert is None:
+        raise ValueError(f"no expert for {env_id!r}; there is one for {', '.join(EXPERT_IDS)}")
+    return load_env_creator(task.expert)()
+
+
+#: Those of ``ENV_IDS`` that have an expert.
+EXPERT_IDS = tuple(filter(has_expert, ENV_IDS))

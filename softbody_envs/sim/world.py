@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import pybullet
-from pybullet_utils.bullet_client import BulletClient
 
-from softbody_envs.sim.quiet import quiet
+from softbody_envs.sim.client import Client
 
 #: One control step: what an action lasts, s (SoftGym: 8 steps of 0.01 s).
 CONTROL_PERIOD = 0.08
@@ -39,9 +38,7 @@ class World:
         self.deformable = deformable
         #: What the scene stands on, if anything.
         self.floor: Floor | None = None
-        with quiet():
-            self.client = BulletClient(pybullet.DIRECT)
-        self._step = self.client.stepSimulation  # the client looks its methods up at every call
+        self.client = Client()
 
     def clear(self) -> None:
         """Remove every body and set all settings again: ``resetSimulation`` forgets some of them and keeps others."""
@@ -55,12 +52,11 @@ class World:
 
     def step(self) -> None:
         """Advance by ``time_step`` seconds."""
-        self._step()
+        self.client.stepSimulation()
 
     def close(self) -> None:
         """Disconnect; closing twice does nothing."""
-        if self.client._client >= 0 and self.client.isConnected():
-            self.client.disconnect()
+        self.client.close()
 
     def add_floor(self, height: float = 0.0) -> Floor:
         """

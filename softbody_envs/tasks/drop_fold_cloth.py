@@ -118,6 +118,8 @@ class DropFoldClothEnv(FoldClothEnv):
     * v0: initial version
     """
 
+    scenes: ClassVar[str] = "DropFoldClothEnv"
+    expert: ClassVar[str | None] = "softbody_envs.experts.drop_fold_cloth:DropFoldClothExpert"
     camera: ClassVar[Camera] = Camera(position=(0.70, -1.00, 1.0), target=(-0.08, 0.0, 0.33))
     workspace: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]] = ((-0.6, -0.45, PICKER_RADIUS), (0.3, 0.45, 0.85))
     state_names: ClassVar[tuple[str, ...]] = (

@@ -70,6 +70,7 @@ class FallingBallEnv(SoftbodyEnv):
     * v0: initial version
     """
 
+    scenes: ClassVar[str] = "FallingBallEnv"
     camera: ClassVar[Camera] = Camera(position=(0.0, -2.5, 1.0), target=(0.0, 0.0, 1.0))
     action_size: ClassVar[int] = 1
     state_names: ClassVar[tuple[str, ...]] = ("ball x", "ball z")

@@ -113,6 +113,8 @@ class FoldClothEnv(PickerEnv):
     * v0: initial version
     """
 
+    scenes: ClassVar[str] = "FoldClothEnv"
+    expert: ClassVar[str | None] = "softbody_envs.experts.fold_cloth:FoldClothExpert"
     camera: ClassVar[Camera] = Camera(position=(0.0, -0.92, 0.95), target=(0.0, 0.0, 0.03))
     state_names: ClassVar[tuple[str, ...]] = (
         *(f"corner {corner} {axis}" for corner in range(4) for axis in "xyz"),

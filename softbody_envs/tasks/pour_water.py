@@ -94,6 +94,8 @@ class PourWaterEnv(SoftbodyEnv):
     * v0: initial version
     """
 
+    scenes: ClassVar[str] = "PourWaterEnv"
+    expert: ClassVar[str | None] = "softbody_envs.experts.pour_water:PourWaterExpert"
     camera: ClassVar[Camera] = Camera(position=(0.25, -1.32, 0.86), target=(0.25, 0.0, 0.31))
     action_size: ClassVar[int] = 3
     state_names: ClassVar[tuple[str, ...]] = (

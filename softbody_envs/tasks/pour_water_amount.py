@@ -78,6 +78,8 @@ class PourWaterAmountEnv(PourWaterEnv):
     * v0: initial version
     """
 
+    scenes: ClassVar[str] = "PourWaterAmountEnv"
+    expert: ClassVar[str | None] = "softbody_envs.experts.pour_water:PourWaterAmountExpert"
     state_names: ClassVar[tuple[str, ...]] = (*PourWaterEnv.state_names, "line height", "target fraction")
     best_performance: ClassVar[float] = 0.0
 

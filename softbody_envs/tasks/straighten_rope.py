@@ -104,6 +104,8 @@ class StraightenRopeEnv(PickerEnv):
     * v0: initial version
     """
 
+    scenes: ClassVar[str] = "StraightenRopeEnv"
+    expert: ClassVar[str | None] = "softbody_envs.experts.straighten_rope:StraightenRopeExpert"
     camera: ClassVar[Camera] = Camera(position=(0.0, 0.0, 0.93), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
     state_names: ClassVar[tuple[str, ...]] = (
         *(f"node {node} {axis}" for node in KEY_NODES for axis in "xyz"),

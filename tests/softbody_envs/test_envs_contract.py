@@ -59,7 +59,8 @@ def equal(a, b):
 @pytest.mark.parametrize(
     ("env_id", "obs_type"), [*((env_id, "pixels") for env_id in ENV_IDS), (ENV_IDS[-1], "state"), (ENV_IDS[-1], "dict")]
 )
-def test_checkers_have_no_complaint(env_id, obs_type):
+def test_checkers_have_no_complaint(env_id, obs_type, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     env = gym.make(env_id, obs_type=obs_type, image_size=36, render_mode="rgb_array", render_size=36)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,9 +1,11 @@
 """What settings may wrap around a task."""
 
 import gymnasium as gym
+import imageio.v3 as iio
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from softbody_envs.experts import make_expert
 from softbody_envs.wrappers import ActionRepeat, ProgressReward
@@ -85,3 +87,24 @@ def test_an_episode_does_not_inherit_the_performance_of_the_last_one():
 def test_a_scale_that_is_not_positive_is_refused(scale):
     with pytest.raises(ValueError, match="scale must be above 0"):
         ProgressReward(gym.make(ID, obs_type="state"), scale)
+
+
+@pytest.mark.parametrize("repeat", [1, 5])
+def test_a_video_of_repeated_actions_lasts_as_long_as_the_episode(tmp_path, repeat):
+    env = gym.make("FallingBall-v0", obs_type="state", render_mode="rgb_array", render_size=32)
+    env = gym.wrappers.RecordVideo(ActionRepeat(env, repeat=repeat), str(tmp_path / "videos"))
+    env.reset(seed=0)
+    while not env.step(env.action_space.sample())[3]:
+        pass
+    env.close()
+    (video,) = tmp_path.glob("videos/*.mp4")
+    properties = iio.immeta(video)
+    assert properties["fps"] == pytest.approx(12.5 / repeat, rel=0.01)
+    assert properties["duration"] == pytest.approx(50 * 0.08, abs=2 * 0.08 * repeat)
+
+
+def test_recorders_of_vector_environments_see_the_same_rate():
+    env = DummyVecEnv([lambda: ActionRepeat(gym.make(ID, obs_type="state", render_mode="rgb_array"), repeat=5)])
+    assert env.metadata["render_fps"] == pytest.approx(2.5)
+    assert gym.make(ID).metadata["render_fps"] == pytest.approx(12.5)
+    env.close()

@@ -1,0 +1,32 @@
+"""Keeps the line that PyBullet prints when it is imported out of the terminal."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+BANNER = b"pybullet build time:"
+
+
+@contextmanager
+def no_banner() -> Iterator[None]:
+    """
+    Drop PyBullet's banner from standard error during a ``with`` block.
+
+    C code writes it, which ``contextlib.redirect_stderr`` cannot reach. Everything else, from other threads, too, appears
+    when the block ends. Redirecting a file descriptor concerns the whole process: do it once, for the import.
+    """
+    try:
+        stderr = os.dup(2)
+    except OSError:  # it is closed
+        yield
+        return
+    with tempfile.TemporaryFile() as written:
+        os.dup2(written.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            written.seek(0)
+            with open(stderr, "wb") as file:
+                file.writelines(line for line in written if not line.startswith(BANNER))

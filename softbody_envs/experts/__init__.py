@@ -1,9 +1,9 @@
 """Scripted experts for the tasks. They act on the state vector and set the ceiling of the scores."""
 
+from pkgutil import resolve_name
 from typing import Protocol
 
 import numpy as np
-from gymnasium.envs.registration import load_env_creator
 
 from softbody_envs.registration import ENV_IDS, task_class
 
@@ -35,7 +35,7 @@ def make_expert(env_id: str) -> Expert:
     task = task_class(env_id)
     if task is None or task.expert is None:
         raise ValueError(f"no expert for {env_id!r}; there is one for {', '.join(EXPERT_IDS)}")
-    return load_env_creator(task.expert)()
+    return resolve_name(task.expert)()
 
 
 #: Those of ``ENV_IDS`` that have an expert.

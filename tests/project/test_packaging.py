@@ -134,11 +134,13 @@ def test_make_installs_once(tmp_path):
     assert again.strip() == f"{tmp_path}/venv/bin/python train.py --algo sac_por --env PourWater-v0 -n 5"
 
 
-def test_the_readme_lists_every_task_and_algorithm():
-    rows = re.findall(r"^\| `([^`]+)` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
-    assert set(rows) == {*ENV_IDS, *ALGORITHMS, "sac"}
+def test_every_task_and_algorithm_is_listed():
+    pages = ROOT / "README.md", ROOT / "docs" / "usage.md"
+    readme, usage = (set(re.findall(r"^\| `([^`]+)` \|", page.read_text(), re.MULTILINE)) for page in pages)
+    assert readme == {*ALGORITHMS, "sac"}
+    assert set(ENV_IDS) <= usage
 
 
-def test_the_readme_begins_with_the_two_commands():
+def test_the_readme_begins_with_the_commands():
     text = (ROOT / "README.md").read_text()
-    assert 0 <= text.index("make train") < text.index("make test") < text.index("make demo") < 1500
+    assert 0 <= text.index("make demo") < text.index("make train") < text.index("make test") < 2500

@@ -34,7 +34,8 @@ class ActionRepeat(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Reco
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See ``gymnasium.Env.step``; observation and info are those of the last repetition."""
         space = self.action_space
-        smaller = self.scale * np.clip(action, space.low, space.high)  # type: ignore[attr-defined]
+        assert isinstance(space, gym.spaces.Box)
+        smaller = self.scale * np.clip(action, space.low, space.high)
         total = 0.0
         for _ in range(self.repeat):
             observation, reward, terminated, truncated, info = self.env.step(smaller.astype(np.float32))

@@ -115,7 +115,7 @@ def restore_buffer(model: BaseAlgorithm, checkpoint: Path) -> None:
         # The environment starts anew: returns of several steps must not run on into that episode. Our buffer knows.
         last = buffer.pos - 1
         buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])
-    model.replay_buffer = buffer  # type: ignore[attr-defined]
+    vars(model)["replay_buffer"] = buffer
 
 
 def read_rng_state(checkpoint: Path) -> dict[str, Any]:

@@ -36,7 +36,7 @@ class VisualActorCritic(VisualAlgorithm, ABC):
     lambda * objective loss, one backward pass, one optimizer step over encoder, critic and objective (two steps, for
     objectives with an optimizer of their own); actor and temperature on the detached trunk features; moving averages last.
 
-    A subclass says how its critic measures values: ``_next_values``, ``_critic_loss`` and ``_actor_values``.
+    A subclass defines how its critic measures values: ``_next_values``, ``_critic_loss`` and ``_actor_values``.
     """
 
     @property
@@ -46,7 +46,7 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         """
         return 1.0
 
-    # -- what a subclass says -------------------------------------------------------------------------------------
+    # -- defined by a subclass ------------------------------------------------------------------------------------
 
     @abstractmethod
     def _next_values(self, features: th.Tensor, actions: th.Tensor, entropy_term: th.Tensor) -> th.Tensor:
@@ -276,7 +276,8 @@ class VisualActorCritic(VisualAlgorithm, ABC):
                 past=augment(take(o_t, len(batch.actions) // 2)) if has_past else None,
             )
             s_t, s_next = self.critic.features(frames.present), self.critic_target.features(frames.next)
-            return self.policy.objective.control(encode(frames, batch, self.policy.objective, s_t, s_next, self.policy))
+            encoded = encode(frames, batch, self.policy.objective, s_t, s_next, self.policy)
+            return self.policy.objective.control(encoded)
 
     def encoder_grad_norms(self, losses: Losses) -> dict[str, th.Tensor]:
         """

@@ -65,7 +65,7 @@ class Augmentation:
     def frames(self, batch: Any, objective: Objective | None, n_present: int, n_next: int) -> Frames:
         """
         :param batch: Samples of the replay buffer
-        :param objective: The objective, which says what it uses; None for none
+        :param objective: The objective, which declares the frames that it uses; None for none
         :param n_present: Number of augmentations of o_t
         :param n_next: Number of augmentations of o_{t+1}
         :return: The frames that an update needs

@@ -36,7 +36,8 @@ class VisualActor(Actor):
         if not self.use_sde:
             # Start with a standard deviation of about 1, as SB3 does, instead of e^-4, the middle of the range
             middle, half_range = 0.5 * (LOG_STD_MAX + LOG_STD_MIN), 0.5 * (LOG_STD_MAX - LOG_STD_MIN)
-            nn.init.constant_(self.log_std.bias, math.atanh(-middle / half_range))  # type: ignore[attr-defined]
+            assert isinstance(self.log_std, nn.Linear)
+            nn.init.constant_(self.log_std.bias, math.atanh(-middle / half_range))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "detach_trunk": self.detach_trunk}
@@ -62,7 +63,8 @@ class VisualActor(Actor):
         mean_actions = self.mu(latent_pi)
         if self.use_sde:
             return mean_actions, self.log_std, dict(latent_sde=latent_pi)
-        log_std = th.tanh(self.log_std(latent_pi))  # type: ignore[operator]
+        assert isinstance(self.log_std, nn.Module)
+        log_std = th.tanh(self.log_std(latent_pi))
         return mean_actions, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1), {}
 
     def action_log_prob_of(self, trunk_features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -262,8 +264,10 @@ class VisualPolicy(BasePolicy):
                 self.critic.features_extractor.features_dim, action_dim, **self.objective_kwargs
             )
 
+        optimizer_class: Any = self.optimizer_class
+
         def optimizer(parameters: list[nn.Parameter]) -> th.optim.Optimizer:
-            return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+            return optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)
 
         trained_with_critic = list(self.critic.parameters())
         self.objective_optimizer = None
@@ -301,7 +305,8 @@ class VisualPolicy(BasePolicy):
         :return: Input of the trunks: float, images in [0, 1] with channels last in memory
         """
         if isinstance(observations, dict):
-            return {key: self._preprocess(part, self.observation_space[key]) for key, part in observations.items()}  # type: ignore[index]
+            assert isinstance(self.observation_space, spaces.Dict)
+            return {key: self._preprocess(part, self.observation_space[key]) for key, part in observations.items()}
         return self._preprocess(observations, self.observation_space)
 
     def _preprocess(self, part: th.Tensor, space: spaces.Space) -> Any:

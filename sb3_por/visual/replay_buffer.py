@@ -133,7 +133,7 @@ class FrameStore:
     def __setstate__(self, state: dict[str, Any]) -> None:
         device = th.device(state["device"] if th.cuda.is_available() else "cpu")
         written, loose = state["ring"], state["loose"]
-        self.__init__(state["n_ring"], len(loose), state["shape"], written.dtype, device)  # type: ignore[misc]
+        FrameStore.__init__(self, state["n_ring"], len(loose), state["shape"], written.dtype, device)
         self.n_written = len(written)
         self.ring[: self.n_written] = th.from_numpy(written)
         self.loose[:] = th.from_numpy(loose)
@@ -186,12 +186,15 @@ class SequenceReplayBuffer(NStepReplayBuffer):
 
         # Internally, any other space is a Dict with one entry
         self.is_dict = isinstance(observation_space, spaces.Dict)
-        self._spaces = dict(observation_space.spaces) if self.is_dict else {"": observation_space}  # type: ignore[attr-defined]
-        self._shapes: dict[str, Any] = dict(self.obs_shape) if self.is_dict else {"": self.obs_shape}  # type: ignore[arg-type]
+        shapes: Any = self.obs_shape
+        self._spaces: dict[str, Any] = (
+            dict(observation_space.spaces) if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+        )
+        self._shapes: dict[str, Any] = dict(shapes) if self.is_dict else {"": shapes}
         n_ring = self.buffer_size * n_envs
         storage_device = self._choose_storage(storage, n_ring)
         self._frames = {
-            key: FrameStore(n_ring, 2 * n_envs, shape, self._spaces[key].dtype, storage_device)  # type: ignore[arg-type]
+            key: FrameStore(n_ring, 2 * n_envs, shape, self._spaces[key].dtype, storage_device)
             for key, shape in self._shapes.items()
         }
         size = (self.buffer_size, n_envs)
@@ -210,7 +213,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
     def _choose_storage(self, storage: str, n_frames: int) -> th.device:
         if storage not in ("auto", "cpu", "cuda"):
             raise ValueError(f"storage must be 'auto', 'cpu' or 'cuda', not {storage!r}.")
-        frame_bytes = sum(int(np.prod(shape)) * self._spaces[key].dtype.itemsize for key, shape in self._shapes.items())  # type: ignore[misc,union-attr]
+        frame_bytes = sum(int(np.prod(shape)) * self._spaces[key].dtype.itemsize for key, shape in self._shapes.items())
         needed = n_frames * (frame_bytes + self.action_dim * 4 + 21)
         if storage == "cuda" and self.device.type != "cuda":
             raise ValueError("storage='cuda' needs a model on a CUDA device: use device='cuda', or storage='auto'.")
@@ -230,7 +233,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
             )
 
     @property
-    def observations(self) -> Any:  # type: ignore[override]
+    def observations(self) -> Any:  # type: ignore[override]  # an attribute in SB3
         """
         :return: o_t of every slot, shape ``(buffer_size, n_envs, ...)`` (a dict of them for ``Dict`` observations);
             a view of the buffer's memory while that is not on a GPU
@@ -245,14 +248,14 @@ class SequenceReplayBuffer(NStepReplayBuffer):
 
         :raises ValueError: If an observation has another shape, or a type that cannot be cast without loss of its kind
         """
-        parts = obs if self.is_dict else {"": obs}
+        parts = self._as_dict(obs)
         return {key: self._check(np.asarray(parts[key]), key) for key in self._shapes}
 
     def _check(self, part: np.ndarray, key: str) -> np.ndarray:
         space, shape = self._spaces[key], (self.n_envs, *self._shapes[key])
         if not isinstance(space, spaces.Box) and part.size == np.prod(shape):
             part = part.reshape(shape)  # Discrete: one number without an axis of its own, as in SB3
-        if part.shape != shape or not np.can_cast(part.dtype, space.dtype, "same_kind"):  # type: ignore[arg-type]
+        if part.shape != shape or not np.can_cast(part.dtype, space.dtype, "same_kind"):
             name = f"the observation {key!r}" if key else "an observation"
             raise ValueError(
                 f"{name} of shape {part.shape} and type {part.dtype} does not fit into a replay buffer for "
@@ -261,13 +264,16 @@ class SequenceReplayBuffer(NStepReplayBuffer):
             )
         return part.astype(space.dtype)
 
+    def _as_dict(self, observations: Any) -> dict[str, Any]:
+        return observations if self.is_dict else {"": observations}
+
     def _unwrap(self, parts: dict[str, Any]) -> Any:
         return parts if self.is_dict else parts[""]
 
     def add(
         self,
-        obs: np.ndarray | dict[str, np.ndarray],  # type: ignore[override]
-        next_obs: np.ndarray | dict[str, np.ndarray],  # type: ignore[override]
+        obs: Any,
+        next_obs: Any,
         action: np.ndarray,
         reward: np.ndarray,
         done: np.ndarray,
@@ -336,7 +342,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         is_first = self.ended[steps - 1, envs[:, None]] | (steps == oldest)
         return np.where(is_first.any(axis=1), is_first.argmax(axis=1), max_steps)
 
-    def sample(  # type: ignore[override]
+    def sample(  # type: ignore[override]  # samples hold more than SB3's
         self,
         batch_size: int,
         env: VecNormalize | None = None,
@@ -361,7 +367,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         )
         return self._samples(slots, envs, gaps, past_gaps, window, env)
 
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> SequenceSamples:  # type: ignore[override]
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
         return self._samples(batch_inds, np.random.randint(0, self.n_envs, size=len(batch_inds)), None, None, 0, env)
 
     def _samples(
@@ -430,5 +436,5 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         parts: dict[str, Any] = {key: store.gather(rows) for key, store in self._frames.items()}
         if env is not None:
             observations = self._normalize_obs(self._unwrap({key: part.cpu().numpy() for key, part in parts.items()}), env)
-            parts = {key: th.as_tensor(part) for key, part in (observations if self.is_dict else {"": observations}).items()}  # type: ignore[union-attr]
+            parts = {key: th.as_tensor(part) for key, part in self._as_dict(observations).items()}
         return self._unwrap({key: to_device(part, self.device) for key, part in parts.items()})

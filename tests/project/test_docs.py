@@ -164,3 +164,14 @@ def test_the_version_to_cite_is_that_of_the_package():
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == config["metadata"]["version"]
+
+
+def test_the_index_of_decisions_lists_all():
+    folder = DOCS / "decisions"
+    pages = {page.name: page.read_text() for page in folder.glob("*.md")}
+    index = pages.pop("README.md")
+    titles = [title for page in pages.values() for title in re.findall(r"^## (.+)$", page, flags=re.MULTILINE)]
+    assert sorted(re.findall(r"^\* \[(.+)\]\(", index, flags=re.MULTILINE)) == sorted(titles)
+    for page in pages.values():
+        for decision in page.split("\n## ")[1:]:
+            assert re.findall(r"^\*\*(\w+)\.\*\*", decision, flags=re.MULTILINE) == ["Context", "Choice", "Price"]

@@ -12,7 +12,9 @@ import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from scipy.integrate import trapezoid
 
 from sb3_por.analysis.figures import plot, plot_order
 from sb3_por.analysis.por_logs import read_order
@@ -94,6 +96,24 @@ def rivals() -> str:
         row = ratios.loc[algo]
         rows.append((f"`{algo}`", f"`{row['rival']}`", with_interval(*row[["ratio", "low", "high"]])))
     return markdown(("", "best of the three", "ratio"), rows)
+
+
+def areas() -> str:
+    """Tabulate the area under each learning curve on pouring."""
+    scores = read_scores([RESULTS / "main" / "scores.csv"]).sort_values("step")
+    table = {key: trapezoid(run[METRIC], run["step"]) / np.ptp(run["step"]) for key, run in scores.groupby(["algo", "seed"])}
+    areas = pd.Series(table).unstack()
+    means = areas.mean(axis=1).sort_values(ascending=False)
+    rows = [
+        (
+            f"`{algo}`",
+            f"{mean:.2f}",
+            ", ".join(f"{area:.2f}" for area in areas.loc[algo]),
+            f"{mean / means['por_lambda_0']:.2f}",
+        )
+        for algo, mean in means.items()
+    ]
+    return markdown(("", "mean area", "each seed", "of `por_lambda_0`"), rows)
 
 
 def weights() -> str:
@@ -218,6 +238,7 @@ def leak() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "comparison": lambda: comparison("main"),
     "rivals": rivals,
+    "areas": areas,
     "full_speed": lambda: comparison("full_speed"),
     "weights": weights,
     "longer": lambda: courses("long"),

@@ -1,4 +1,4 @@
-"""The Gymnasium contract, once for all tasks: spaces, seeding, variations, info, images, faults."""
+"""Base class of all tasks: spaces, seeding, variations, info, images and failed simulations."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -14,22 +14,22 @@ from softbody_envs.variations import SPLITS, check_variation, variation_rng
 from softbody_envs.window import Window
 
 OBS_TYPES = ("pixels", "state", "dict")
-#: Bound of every element of a state vector, in the units of its task's page; a value beyond it is clipped.
+#: Bound of every element of a state vector, in the units of the task's page. Values are clipped to it.
 STATE_LIMIT = 10.0
-#: Rounding errors do not decide whether an episode is a success.
+#: Tolerance of the success test: a rounding error must not decide it.
 TOLERANCE = 1e-9
 
 
 class SoftbodyEnv(gym.Env, EzPickle, ABC):
     """
-    Base class of the tasks. A task names its camera, action size and state, builds its scene, and scores it.
+    Base class of the tasks. A task defines its camera, action size and state vector, builds its scene and scores it.
 
-    Actions are float32 in [-1, 1]; episodes end by truncation at the registered horizon, never by termination.
+    Actions are float32 in [-1, 1]. Episodes end by truncation at the registered horizon, never by termination.
 
     :param obs_type: ``"pixels"`` (uint8 image, height x width x 3), ``"state"`` (float32 vector) or ``"dict"``
         (``{"image": ..., "state": ...}``)
     :param image_size: height and width of the observed image, pixels
-    :param split: ``"train"`` (variations 0-799) or ``"eval"`` (800-999): what ``reset`` draws from
+    :param split: variations that ``reset`` draws from: ``"train"`` (0-799) or ``"eval"`` (800-999)
     :param renderer: ``"tiny"`` (any machine) or ``"egl"`` (graphics driver)
     :param render_mode: ``None``, ``"rgb_array"`` (``render`` returns an image) or ``"human"`` (a window shows every step in
         real time; needs the extra ``human``)
@@ -38,11 +38,11 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 1 / CONTROL_PERIOD}  # noqa: RUF012
 
-    #: Seeds the variations, with their index. Subclasses inherit it: the same task with another reward has the same scenes.
+    #: Name that seeds the variations. Subclasses inherit it: the same task with another reward has the same scenes.
     scenes: ClassVar[str]
-    #: Entry point, "module:class", of the scripted expert, if there is one.
+    #: Entry point of the scripted expert, ``"module:class"``, if there is one.
     expert: ClassVar[str | None] = None
-    #: What the images show.
+    #: Camera of the images.
     camera: ClassVar[Camera]
     #: Number of elements of an action.
     action_size: ClassVar[int]
@@ -52,8 +52,9 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
     best_performance: ClassVar[float]
     #: Normalized performance from which ``info["is_success"]`` holds.
     success_threshold: ClassVar[float]
-    #: Simulation steps in one control step, and whether the world holds cloth.
+    #: Simulation steps in one control step.
     steps_per_control: ClassVar[int]
+    #: Whether the world holds cloth.
     deformable: ClassVar[bool] = False
 
     def __init__(
@@ -95,47 +96,49 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         self.variation = -1  # none before the first reset
         self._initial_performance = 0.0
 
-    # -- what a task says ------------------------------------------------------------------------------------------
+    # -- defined by each task --------------------------------------------------------------------------------------
 
     @abstractmethod
     def _build(self, world: World, rng: np.random.Generator) -> None:
-        """Put the scene of one variation, at rest, into an empty world; ``rng`` draws what varies."""
+        """Build the scene of one variation, at rest, in an empty world. ``rng`` draws everything that varies."""
 
     @abstractmethod
     def _control(self, action: np.ndarray) -> None:
-        """Carry out one action, clipped to [-1, 1], and advance the world by one control step."""
+        """Apply one action, clipped to [-1, 1], and advance the world by one control step."""
 
     @abstractmethod
     def _measure(self) -> np.ndarray:
-        """The elements of ``state_names`` now, in the units of the task's page."""
+        """Return the elements of ``state_names``, in the units of the task's page."""
 
     @abstractmethod
     def performance(self) -> float:
-        """How well the task is solved now, in SoftGym's units."""
+        """Performance in the present state, in SoftGym's units."""
 
     @abstractmethod
     def monotone(self) -> float:
-        """The physical quantity that rises while the task is being solved."""
+        """Physical quantity that rises while the task is being solved."""
 
     def reward(self) -> float:
         """Reward of the present state (SoftGym: the performance)."""
         return self.performance()
 
     def fault(self) -> str | None:
-        """What is wrong with the simulation (an explosion), or ``None``. Checked after every control step."""
+        """Describe why the simulation has failed, or return ``None``. Checked after every control step."""
         return None
 
     def _image(self, size: int) -> np.ndarray:
-        """A fresh RGB image, uint8 ``(size, size, 3)``."""
+        """Render a new RGB image, uint8 ``(size, size, 3)``."""
         return self.renderer.render(self.world, self.camera, size)[0]
 
     # -- Gymnasium -------------------------------------------------------------------------------------------------
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
-        Build a variation: ``options={"variation": i}`` names one of 0..999, otherwise the split's are drawn from.
+        Start an episode in a variation drawn from the split, or in the one given by ``options={"variation": i}``.
 
-        :raises ValueError: on an unknown option or an index out of range
+        :param seed: seed of the random generator that draws variations
+        :param options: ``{"variation": i}`` with i in 0..999, or nothing
+        :raises ValueError: if an option is unknown or the index is out of range
         """
         super().reset(seed=seed)
         options = options or {}
@@ -159,9 +162,9 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
-        One control step of 0.08 s. Actions beyond [-1, 1] are clipped.
+        Advance by one control step of 0.08 s. Actions are clipped to [-1, 1].
 
-        :raises ValueError: if the action has the wrong shape or is not finite; nothing has moved then
+        :raises ValueError: if the action has the wrong shape or is not finite; the state is unchanged then
         """
         if self._world is None:
             raise gym.error.ResetNeeded("call reset() before step()")
@@ -175,11 +178,11 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         if fault is None:
             observation, reward, info = self._outcome()
         else:
-            # Positions mean nothing any more: repeat the last sound step, end the episode, and start the next one
-            # from a fresh client.
+            # Positions are meaningless now: return the last valid outcome, end the episode, and start the next one in a
+            # new world.
             self._disconnect()
             self._faulty = True
-            observation, reward, info = self._last_sound
+            observation, reward, info = self._last_valid
             info = info | {"sim_error": fault}
         if self._window is not None:
             self.render()
@@ -187,12 +190,12 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
 
     def render(self) -> np.ndarray | None:
         """
-        Draw the present state; black after the simulation has failed.
+        Render the present state. The image is black if the simulation has failed.
 
         :return: an RGB image, uint8 ``(render_size, render_size, 3)``, if ``render_mode`` is ``"rgb_array"``
         """
         if self.render_mode is None:
-            gym.logger.warn('render() returns nothing: make the environment with render_mode="rgb_array"')
+            gym.logger.warn('render() does nothing without a render mode: make the environment with render_mode="rgb_array"')
             return None
         size = self.render_size
         frame = np.zeros((size, size, 3), np.uint8) if self._faulty else self._image(size)
@@ -202,7 +205,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         return None
 
     def close(self) -> None:
-        """Close the window and free the Bullet client; ``reset`` opens new ones."""
+        """Close the window and free the simulation. ``reset`` starts a new one."""
         self._disconnect()
         if self._window is not None:
             self._window.close()
@@ -215,7 +218,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
     @property
     def world(self) -> World:
         """
-        The Bullet world of the episode.
+        Bullet world of the episode.
 
         :raises gymnasium.error.ResetNeeded: before the first ``reset`` and after ``close``
         """
@@ -224,7 +227,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         return self._world
 
     def _open(self) -> World:
-        """A new world, which the renderer knows."""
+        """Make a world that the renderer can draw."""
         world = World(self.steps_per_control, self.deformable)
         try:
             self.renderer.attach(world)
@@ -236,11 +239,11 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
     # -- derived ---------------------------------------------------------------------------------------------------
 
     def state(self) -> np.ndarray:
-        """The state vector, float32, whatever the observation type is; see ``state_names``."""
+        """State vector, float32, for any observation type. Its elements are ``state_names``."""
         return np.clip(self._measure(), -STATE_LIMIT, STATE_LIMIT).astype(np.float32)
 
     def normalized_performance(self) -> float:
-        """0: no better than at reset. 1: perfect."""
+        """Performance on a scale from 0 (as at reset) to 1 (perfect)."""
         span = self.best_performance - self._initial_performance
         return (self.performance() - self._initial_performance) / span
 
@@ -251,9 +254,9 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         return image if self.obs_type == "pixels" else {"image": image, "state": self.state()}
 
     def _outcome(self) -> tuple[Any, float, dict[str, Any]]:
-        """Observation, reward and info of now, remembered in case that the next step fails."""
+        """Return observation, reward and info of the present state, and keep a copy in case the next step fails."""
         outcome = self._observation(), float(self.reward()), self._info()
-        self._last_sound = copy.deepcopy(outcome)  # the caller may change what it gets
+        self._last_valid = copy.deepcopy(outcome)  # callers may modify what they get
         return outcome
 
     def _info(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Draws what a renderer leaves out: a cloth with its folds and both its sides, and the shadows of spheres on the floor."""
+"""Drawing that Bullet's renderers lack: cloth with shaded folds and two colours, and shadows of spheres on the floor."""
 
 from functools import lru_cache
 
@@ -8,15 +8,15 @@ from scipy.interpolate import CubicSpline
 from softbody_envs.rendering import FLOOR_COLOR, NOTHING, Camera, on_floor
 from softbody_envs.sim.world import Floor
 
-#: Toward the light, and how bright a surface is that faces away from it.
+#: Direction toward the light, and the brightness of surfaces that face away from it.
 LIGHT = np.array([-0.5, -1.5, 2.5]) / np.linalg.norm([-0.5, -1.5, 2.5])
 AMBIENT = 0.5
-#: Two directions across the light, as columns: what light sees is a picture in these.
+#: Basis of the plane perpendicular to the light, as columns. Shadows are computed in this plane.
 ACROSS_LIGHT = np.linalg.svd(LIGHT[None])[2][1:].T
-#: Points a pixel along each direction of the sheet: no pixel inside it stays empty.
+#: Points per pixel along each direction of the sheet: enough to leave no pixel inside it empty.
 DENSITY = 1.45
-#: The sheet is this far in front of what it lies on, and its underside, which a fold turns up, in front of its face: m,
-#: and in lengths that a pixel covers, for that is how well a pixel tells distances on a slope.
+#: Depth offset of the sheet in front of what it lies on, and of its underside (turned up by a fold) in front of its face:
+#: m, plus a multiple of the length that a pixel covers, since depth within a pixel varies that much on a slope.
 CLEARANCE = 0.004
 PIXELS_CLEARANCE = 1.5
 
@@ -32,18 +32,18 @@ def paint_sheet(
     radius: float,
 ) -> None:
     """
-    Bullet never updates the normals of a cloth, so a renderer shows no fold of it (bullet3 6c888f4ab).
+    Draw a cloth into an image: a smooth surface through its nodes, point by point, farthest first.
 
-    The sheet is a smooth surface through the nodes, drawn point by point, the farthest first.
+    Bullet never updates the normals of a cloth, so its renderers do not show folds (bullet3 6c888f4ab).
 
-    :param frame: RGB image, uint8 ``(size, size, 3)``; changed in place
-    :param depth: its depth buffer, float ``(size, size)`` in [0, 1]
-    :param camera: what it was rendered with
+    :param frame: RGB image, uint8 ``(size, size, 3)``, modified in place
+    :param depth: depth buffer of the image, float ``(size, size)`` in [0, 1]
+    :param camera: camera of the image
     :param grid: nodes of the sheet, m, ``(rows, columns, 3)``
     :param face: colour of the side from which columns follow rows counterclockwise, RGB in [0, 1]
     :param underside: colour of the other side
-    :param centers: of spheres that cast shadows on it, m, ``(n, 3)``
-    :param radius: of the spheres, m
+    :param centers: centres of the spheres that cast shadows on the sheet, m, ``(n, 3)``
+    :param radius: radius of the spheres, m
     """
     size = len(frame)
     points, normals = _surface(grid, camera, size)
@@ -68,7 +68,7 @@ def paint_sheet(
 
 
 def _shaded(points: np.ndarray, centers: np.ndarray, radius: float) -> np.ndarray:
-    """Which points a sphere between them and the light shades, ``(n,)``."""
+    """Mask of the points that are in the shadow of a sphere, ``(n,)``."""
     ways = centers[:, None] - points
     across = ((ways @ ACROSS_LIGHT) ** 2).sum(axis=-1) < radius**2
     return (across & (ways @ LIGHT > 0)).any(axis=0)
@@ -78,15 +78,16 @@ def paint_shadows(
     frame: np.ndarray, depth: np.ndarray, camera: Camera, floor: Floor, centers: np.ndarray, radius: float
 ) -> None:
     """
-    Shadows of spheres on the floor, which tell a camera above them how high they are. Bullet's own take twice the time and
-    need a floor that is a body.
+    Draw the shadows of spheres on the floor. They show how high the spheres are, even to a camera above them.
 
-    :param frame: RGB image, uint8 ``(size, size, 3)``; changed in place
-    :param depth: its depth buffer, float ``(size, size)`` in [0, 1]
-    :param camera: what it was rendered with
-    :param floor: what the shadows fall on
-    :param centers: of the spheres, m, ``(n, 3)``
-    :param radius: of the spheres, m
+    Bullet's own shadows take twice the time and need a visible floor body.
+
+    :param frame: RGB image, uint8 ``(size, size, 3)``, modified in place
+    :param depth: depth buffer of the image, float ``(size, size)`` in [0, 1]
+    :param camera: camera of the image
+    :param floor: floor that the shadows fall on
+    :param centers: centres of the spheres, m, ``(n, 3)``
+    :param radius: radius of the spheres, m
     """
     points, seen = _lit_floor(camera, len(frame), floor)
     seen = seen & (depth >= NOTHING)
@@ -97,7 +98,7 @@ def paint_shadows(
 
 @lru_cache(maxsize=32)
 def _lit_floor(camera: Camera, size: int, floor: Floor) -> tuple[np.ndarray, np.ndarray]:
-    """The floor's points behind the pixels as the light sees them, m, ``(size, size, 2)``, and which are on the floor."""
+    """Points of the floor behind the pixels, projected along the light, m, ``(size, size, 2)``, and the mask of the floor."""
     points, seen = on_floor(camera, size, floor)
     return points @ ACROSS_LIGHT, seen
 
@@ -107,7 +108,7 @@ def _surface(grid: np.ndarray, camera: Camera, size: int) -> tuple[np.ndarray, n
     x, y, _ = _project(grid, camera, size)
     flat = np.stack([x, y], axis=-1)
     longest = max(np.linalg.norm(np.diff(flat, axis=axis), axis=-1).max() for axis in (0, 1))
-    per_cell = int(np.clip(np.ceil(DENSITY * longest), 1, size // 4))  # a cell beside the eye is not worth more
+    per_cell = int(np.clip(np.ceil(DENSITY * longest), 1, size // 4))  # a cell next to the camera needs no more
     (rows, along_rows), (columns, along_columns) = (_spline(n, per_cell) for n in grid.shape[:2])
     across = np.tensordot(columns, grid, (1, 1)).swapaxes(0, 1)
     points = np.tensordot(rows, across, 1)
@@ -118,7 +119,7 @@ def _surface(grid: np.ndarray, camera: Camera, size: int) -> tuple[np.ndarray, n
 
 @lru_cache(maxsize=64)
 def _spline(n: int, per_cell: int) -> tuple[np.ndarray, np.ndarray]:
-    """The matrices ``(m, n)`` that take values at ``n`` knots to the smooth curve between them and to its slope."""
+    """Matrices ``(m, n)`` from values at ``n`` knots to the points and the slopes of the spline through them."""
     spline = CubicSpline(np.arange(n), np.eye(n), bc_type="natural")
     at = np.linspace(0, n - 1, (n - 1) * per_cell + 1)
     return spline(at), spline(at, 1)
@@ -134,10 +135,10 @@ def _project(points: np.ndarray, camera: Camera, size: int) -> tuple[np.ndarray,
 
 
 def _focal(camera: Camera, size: int) -> float:
-    """Pixels that something at distance 1 and of size 1 covers."""
+    """Focal length in pixels."""
     return size / 2 / np.tan(np.radians(camera.fov) / 2)
 
 
 def _distances(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """A depth buffer in metres in front of the camera."""
+    """Convert a depth buffer to distances in front of the camera, m."""
     return camera.near * camera.far / (camera.far - (camera.far - camera.near) * depth)

@@ -1,4 +1,4 @@
-"""The table of environment ids, and the class that an id stands for."""
+"""Registered environment ids, and the task class behind an id."""
 
 from importlib import import_module
 from typing import Any
@@ -19,12 +19,12 @@ _TABLE = {
     "SwingingBall-v0": ("swinging_ball:SwingingBallEnv", 100),
 }
 
-#: Every id that ``import softbody_envs`` registers.
+#: Ids that ``import softbody_envs`` registers.
 ENV_IDS = tuple(_TABLE)
 
 
 def register_envs() -> None:
-    """Register every task with Gymnasium; importing again changes nothing."""
+    """Register every task with Gymnasium. A second call changes nothing."""
     for env_id, (entry_point, horizon) in _TABLE.items():
         if env_id not in gym.registry:
             gym.register(env_id, entry_point=f"softbody_envs.tasks.{entry_point}", max_episode_steps=horizon)
@@ -32,11 +32,11 @@ def register_envs() -> None:
 
 def task_class(env_id: str) -> type[SoftbodyEnv] | None:
     """
-    Find the task that an id stands for: one of ours, or a variant of a user's own (another id, defaults or subclass).
+    Return the task class behind an id: one of ours, or a user's variant of one (own id, own defaults or subclass).
 
     :param env_id: registered id, as ``gymnasium.make`` takes it: the module that registers it may stand in front
         (``"module:Id-v0"``), the version may be left out
-    :return: class of the environment inside all wrappers; ``None`` if there is no such id or it is no task
+    :return: class of the unwrapped environment, or ``None`` if the id is unknown or not a task of this package
     """
     try:
         made = _made_class(_find_spec(env_id))
@@ -56,13 +56,13 @@ def _find_spec(env_id: str) -> EnvSpec:
 
 
 def _made_class(spec: EnvSpec) -> type:
-    """Class of what an entry point makes. Functions and wrappers are called to see it."""
+    """Class of the environment that an entry point makes. Functions and wrappers are called to find out."""
     creator: Any = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
     if isinstance(creator, type) and not issubclass(creator, gym.Wrapper):
         return creator
     try:
         env = creator(**spec.kwargs)
-    except TypeError:  # it needs arguments that the id does not have
+    except TypeError:  # it needs arguments that the spec does not have
         return object
     env.close()
     return type(env.unwrapped)

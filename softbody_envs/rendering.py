@@ -11,7 +11,7 @@ from softbody_envs.sim.world import Floor, World
 
 RENDERERS = ("tiny", "egl")
 FLOOR_COLOR, SKY_COLOR = 201, 255
-#: Depth from which on a pixel shows no body.
+#: Smallest depth of a pixel that shows no body.
 NOTHING = 1 - 1e-6
 
 
@@ -20,10 +20,12 @@ class Camera:
     """
     A fixed perspective camera with square images.
 
-    :param position: of the eye, m, z up
-    :param target: the point that appears in the middle of the image, m
+    :param position: position of the camera, m, z up
+    :param target: point in the middle of the image, m
     :param fov: vertical field of view, degrees (SoftGym: 45)
     :param up: direction that points up in the image
+    :param near: distance of the near clipping plane, m
+    :param far: distance of the far clipping plane, m
     """
 
     position: tuple[float, float, float]
@@ -35,20 +37,20 @@ class Camera:
 
     @property
     def view(self) -> tuple[float, ...]:
-        """World to camera, 16 numbers, column-major as OpenGL has it."""
+        """World-to-camera matrix, 16 numbers, column-major as in OpenGL."""
         return pybullet.computeViewMatrix(self.position, self.target, self.up)
 
     @property
     def projection(self) -> tuple[float, ...]:
-        """Camera to clip space, 16 numbers, column-major."""
+        """Camera-to-clip-space matrix, 16 numbers, column-major."""
         return pybullet.computeProjectionMatrixFOV(self.fov, 1.0, self.near, self.far)
 
 
 class Renderer:
     """
-    Draws a world as a camera sees it.
+    Renders a world as seen by a camera.
 
-    Images of the two kinds differ (bullet#2410): train and evaluate with the same one.
+    Images of the two kinds differ (bullet#2410): train and evaluate with the same kind.
 
     :param kind: ``"tiny"`` (software, deterministic) or ``"egl"`` (OpenGL without a display)
     """
@@ -60,18 +62,18 @@ class Renderer:
         self._flag = pybullet.ER_TINY_RENDERER if kind == "tiny" else pybullet.ER_BULLET_HARDWARE_OPENGL
 
     def attach(self, world: World) -> None:
-        """Load what the renderer needs into a world that holds no bodies yet."""
+        """Prepare a world that holds no bodies yet for rendering."""
         if self.kind == "egl":
             plugin = importlib.util.find_spec("eglRenderer")
             loaded = plugin is not None and world.client.loadPlugin(plugin.origin, "_eglRendererPlugin") >= 0
             if not loaded:
-                raise RuntimeError('renderer="egl" needs an EGL driver, which this machine lacks; use renderer="tiny"')
+                raise RuntimeError('renderer="egl" needs an EGL driver, and this machine has none; use renderer="tiny"')
 
     def render(self, world: World, camera: Camera, size: int) -> tuple[np.ndarray, np.ndarray]:
         """
-        The floor comes from ``backdrop``, behind all else; as a body it would cost half of an 84-pixel frame.
+        Render a frame. The floor comes from ``backdrop``: as a body it would take half the time of an 84-pixel frame.
 
-        :return: a fresh RGB frame, uint8 ``(size, size, 3)``, and the bodies' depth buffer, float32 ``(size, size)`` in
+        :return: new RGB frame, uint8 ``(size, size, 3)``, and depth buffer of the bodies, float32 ``(size, size)`` in
             [0, 1]
         """
         _, _, rgba, depth, _ = world.client.getCameraImage(
@@ -92,9 +94,9 @@ class Renderer:
 @lru_cache(maxsize=32)
 def backdrop(camera: Camera, size: int, floor: Floor | None) -> np.ndarray:
     """
-    The scene without its bodies.
+    Return the image of a scene without bodies.
 
-    :return: an RGB image to read from, uint8 ``(size, size, 3)``
+    :return: read-only RGB image, uint8 ``(size, size, 3)``
     """
     image = np.full((size, size, 3), SKY_COLOR, np.uint8)
     if floor is not None:
@@ -106,10 +108,10 @@ def backdrop(camera: Camera, size: int, floor: Floor | None) -> np.ndarray:
 @lru_cache(maxsize=32)
 def on_floor(camera: Camera, size: int, floor: Floor) -> tuple[np.ndarray, np.ndarray]:
     """
-    What a camera sees of a floor.
+    Intersect the rays of a camera's pixels with a floor.
 
-    :return: the points of the floor's plane behind the pixels, m, ``(size, size, 3)``, and which of them the camera sees
-        and belong to the floor, bool ``(size, size)``; to read from
+    :return: points of the floor's plane behind the pixels, m, ``(size, size, 3)``, and the mask of those that lie on the
+        floor in front of the camera, bool ``(size, size)``; both read-only
     """
     across = (2 * np.arange(size) + 1 - size) / size * np.tan(np.radians(camera.fov) / 2)
     right, up, back = np.reshape(camera.view, (4, 4), order="F")[:3, :3]

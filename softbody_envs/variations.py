@@ -1,18 +1,19 @@
-"""Variations: 1000 numbered scenes a task, 800 to train on and 200 held out, the same on every machine."""
+"""Variations: 1000 numbered scenes per task, the same on every machine. 800 are for training, 200 are held out."""
 
 import zlib
 
 import numpy as np
 
-#: The indices that each split draws from.
+#: Indices of each split.
 SPLITS = {"train": range(0, 800), "eval": range(800, 1000)}
 N_VARIATIONS = 1000
 
 
 def check_variation(index: object) -> int:
     """
-    :param index: what a user passed as ``options["variation"]``
-    :return: the index as an int
+    Validate ``options["variation"]``.
+
+    :return: index as an int
     :raises ValueError: if it is not an integer in 0..999
     """
     if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < N_VARIATIONS:

@@ -8,7 +8,7 @@ import numpy as np
 
 class Window:
     """
-    Shows frames at a constant rate. As pygame has it, a process has one window: environments that draw at once share it.
+    Shows frames at a constant rate. pygame has one window per process: several environments share it.
 
     :param fps: frames per second
     :raises gymnasium.error.DependencyNotInstalled: if pygame is missing
@@ -26,7 +26,7 @@ class Window:
 
     def show(self, frame: np.ndarray) -> None:
         """
-        Draw a frame; wait first until the one before has been seen for its time.
+        Draw a frame after the previous one has been visible for its full time.
 
         :param frame: RGB, uint8 ``(height, width, 3)``
         """
@@ -37,9 +37,9 @@ class Window:
             screen = display.set_mode(size)
         self._clock.tick(self._fps)
         self._pygame.surfarray.blit_array(screen, frame.swapaxes(0, 1))
-        self._pygame.event.pump()  # or the desktop takes the window for one that hangs
+        self._pygame.event.pump()  # otherwise the desktop reports that the window does not respond
         display.flip()
 
     def close(self) -> None:
-        """Close the window; the next frame opens it again."""
+        """Close the window. The next frame opens it again."""
         self._pygame.display.quit()

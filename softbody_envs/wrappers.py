@@ -8,15 +8,15 @@ import numpy as np
 
 class ActionRepeat(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.RecordConstructorArgs):
     """
-    Repeats each action, made smaller first, until the episode ends; the rewards of the repetitions add up.
+    Scale each action and repeat it. Rewards of the repetitions are summed; the end of an episode ends the repetition.
 
-    Exploration goes on for longer in one direction, and returns have fewer steps. The tasks' grip (a pick above 0) has
-    a sign only, which a smaller action keeps.
+    Random exploration moves farther in one direction, and returns have fewer steps. Scaling does not affect grasping, for
+    which only the sign of the action counts.
 
-    :param env: with a ``Box`` action space
-    :param repeat: control steps of each action, at least 1
-    :param scale: factor on the actions, above 0 and at most 1
-    :raises ValueError: on another ``repeat`` or ``scale``
+    :param env: Environment with a ``Box`` action space
+    :param repeat: Control steps per action, at least 1
+    :param scale: Factor on the actions, above 0 and at most 1
+    :raises ValueError: If ``repeat`` or ``scale`` is out of range
     """
 
     def __init__(self, env: gym.Env[Any, np.ndarray], repeat: int, scale: float = 1.0):
@@ -28,17 +28,17 @@ class ActionRepeat(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Reco
             raise ValueError(f"scale must be above 0 and at most 1, got {scale!r}")
         self.repeat = int(repeat)
         self.scale = scale
-        if "render_fps" in env.metadata:  # whoever records sees one frame per repeated action
+        if "render_fps" in env.metadata:  # video recorders get one frame per repeated action
             self.metadata = env.metadata | {"render_fps": env.metadata["render_fps"] / self.repeat}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """See ``gymnasium.Env.step``; observation and info are those of the last repetition."""
+        """See ``gymnasium.Env.step``. Observation and info are those of the last repetition."""
         space = self.action_space
         assert isinstance(space, gym.spaces.Box)
-        smaller = self.scale * np.clip(action, space.low, space.high)
+        scaled = self.scale * np.clip(action, space.low, space.high)
         total = 0.0
         for _ in range(self.repeat):
-            observation, reward, terminated, truncated, info = self.env.step(smaller.astype(np.float32))
+            observation, reward, terminated, truncated, info = self.env.step(scaled.astype(np.float32))
             total += float(reward)
             if terminated or truncated:
                 break
@@ -47,7 +47,7 @@ class ActionRepeat(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Reco
 
 class ProgressReward(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.RecordConstructorArgs):
     """
-    Rewards the change of ``info["normalized_performance"]`` instead of its level.
+    Reward the change of ``info["normalized_performance"]`` instead of its level.
 
     SoftGym's rewards are levels: an episode that starts far from the goal pays for the distance at every step, whatever the
     agent does. The undiscounted sum of the progress is the final performance times ``scale``, which is the score of these

@@ -16,21 +16,25 @@ class Expert(Protocol):
 
     def act(self, state: np.ndarray) -> np.ndarray:
         """
-        :param state: the task's state vector
-        :return: an action in [-1, 1]
+        Choose an action.
+
+        :param state: state vector of the task
+        :return: action in [-1, 1]
         """
 
 
 def has_expert(env_id: str) -> bool:
-    """Whether the task behind an id, one of ours or a subclass of it, names an expert."""
+    """Test whether the task behind an id, one of ours or a subclass of one, has an expert."""
     task = task_class(env_id)
     return task is not None and task.expert is not None
 
 
 def make_expert(env_id: str) -> Expert:
     """
-    :param env_id: id of a task that has an expert: one of ours, or one registered for the same class or a subclass of it
-    :raises ValueError: if it has none
+    Make the expert of a task.
+
+    :param env_id: id of a task that has an expert, or of a subclass of such a task
+    :raises ValueError: if there is no expert for this id
     """
     task = task_class(env_id)
     if task is None or task.expert is None:
@@ -38,5 +42,5 @@ def make_expert(env_id: str) -> Expert:
     return resolve_name(task.expert)()
 
 
-#: Those of ``ENV_IDS`` that have an expert.
+#: Ids in ``ENV_IDS`` that have an expert.
 EXPERT_IDS = tuple(filter(has_expert, ENV_IDS))

@@ -1,4 +1,4 @@
-"""Lower the hanging cloth, lay its lower half on the floor, and fold the upper half over it."""
+"""Expert for DropFoldCloth: lower the cloth, lay its lower half on the floor, and fold the upper half over it."""
 
 from functools import partial
 
@@ -8,15 +8,15 @@ from softbody_envs.experts import fold_cloth
 from softbody_envs.experts.fold_cloth import Script, ScriptedExpert, corners, leave, pickers
 from softbody_envs.tasks.drop_fold_cloth import PICKER_REACH
 
-#: The cloth hangs free, so that its length can be seen, when its lower corners are this high, m.
+#: Height of the lower corners at which the cloth hangs freely, so that its length is known, m.
 HANGING = 0.02
-#: How far one step lifts it until then, m.
+#: Lift per control step until then, m.
 LIFT = 0.01
 #: Control steps of each movement.
 LOWER_STEPS = 8
 LAY_STEPS = 20
 FOLD_STEPS = 16
-#: The cloth is laid with its free part at this angle to the vertical, rad, so that it does not fold under itself.
+#: Angle between the hanging part and the vertical while the cloth is laid down, rad: it must not fold under itself.
 LEAN = 0.3
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -24,10 +24,10 @@ go = partial(fold_cloth.go, reach=PICKER_REACH)
 
 
 class DropFoldClothExpert(ScriptedExpert):
-    """Folds without ever letting go."""
+    """Folds without releasing the cloth before the end."""
 
     def script(self, state: np.ndarray) -> Script:
-        """Lift the cloth until it hangs, then three arcs of the held edge; the pickers stay above the corners they hold."""
+        """Lift the cloth until it hangs freely, lower it, lay its lower half on the floor, fold the upper half, release."""
         while corners(state)[2:, 2].min() < HANGING:
             state = yield go(pickers(state) + LIFT * UP, state, pick=True)
         held, free = corners(state)[:2], corners(state)[2:]
@@ -35,7 +35,7 @@ class DropFoldClothExpert(ScriptedExpert):
         length = np.linalg.norm(held - free, axis=1).mean()
         forward = np.cross(held[1] - held[0], UP)
         forward /= np.linalg.norm(forward)
-        place = held * (1, 1, 0)  # the free edge belongs on the floor beneath the held one
+        place = held * (1, 1, 0)  # the goal of the free edge is on the floor below the held edge
 
         for height in np.linspace(held[:, 2].mean(), length, LOWER_STEPS + 1)[1:]:
             state = yield go(place + height * UP + grip, state, pick=True)

@@ -1,4 +1,4 @@
-"""Take two corners and carry them over the cloth to the corners opposite."""
+"""Expert for FoldCloth: grasp two corners and carry them over the cloth to the opposite corners."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Generator
@@ -7,31 +7,31 @@ import numpy as np
 
 from softbody_envs.sim.pickers import REACH
 
-#: Height of a picker's centre above the corner it takes, m, and while it travels to it.
+#: Height of a picker's centre above a corner when it grasps it, m, and while it travels to it, m.
 GRASP_HEIGHT = 0.045
 TRAVEL_HEIGHT = 0.10
-#: Control steps that the carried edge is in the air, and its highest point, in half lengths of the cloth.
+#: Control steps in which the edge is carried, and its largest height, as a fraction of half the length of the cloth.
 CARRY_STEPS = 28
 ARCH = 0.95
-#: Two positions nearer than this are the same, m.
+#: Distance at which a position counts as reached, m.
 NEAR = 0.01
 
-#: Yields an action and is sent the next state.
+#: A script yields actions and is sent the states that follow.
 Script = Generator[np.ndarray, np.ndarray, None]
 
 
 class ScriptedExpert(ABC):
-    """Plays a script."""
+    """An expert that follows a script: one action after the other."""
 
     def __init__(self) -> None:
         self._script: Script | None = None
 
     def reset(self) -> None:
-        """Start again with the next state."""
+        """Restart the script at the next state."""
         self._script = None
 
     def act(self, state: np.ndarray) -> np.ndarray:
-        """The next action of the script."""
+        """Return the next action of the script."""
         state = np.asarray(state, dtype=np.float64)
         if self._script is not None:
             return self._script.send(state)
@@ -40,11 +40,11 @@ class ScriptedExpert(ABC):
 
     @abstractmethod
     def script(self, state: np.ndarray) -> Script:
-        """A script that begins in a state and never ends."""
+        """Start a script, which never ends, in a state."""
 
 
 def corners(state: np.ndarray) -> np.ndarray:
-    """Of the cloth: the two of the edge to carry, then the two they belong on, m, ``(4, 3)``."""
+    """Corners of the cloth: the two to carry, then the two where those belong, m, ``(4, 3)``."""
     return state[:12].reshape(4, 3)
 
 
@@ -53,14 +53,19 @@ def pickers(state: np.ndarray) -> np.ndarray:
     return state[12:18].reshape(2, 3)
 
 
+def holding(state: np.ndarray) -> np.ndarray:
+    """Whether each picker holds the cloth, bool ``(2,)``."""
+    return state[18:20] > 0.5
+
+
 def go(goals: np.ndarray, state: np.ndarray, pick: bool, reach: float = REACH) -> np.ndarray:
-    """The action that takes the pickers to their goals, m, ``(2, 3)``, or as near as one step of ``reach`` m can."""
+    """Action that moves the pickers to their goals, m, ``(2, 3)``, or toward them by at most ``reach`` m per axis."""
     move = np.clip((goals - pickers(state)) / reach, -1.0, 1.0)
     return np.column_stack([move, np.full(2, 1.0 if pick else -1.0)]).ravel()
 
 
 def leave(state: np.ndarray) -> Script:
-    """Let go, then rise and stay there."""
+    """Release, rise, and stay there."""
     goals = pickers(state)
     state = yield go(goals, state, pick=False)
     goals = goals + (0.0, 0.0, TRAVEL_HEIGHT)
@@ -72,14 +77,14 @@ class FoldClothExpert(ScriptedExpert):
     """Folds the cloth along its middle."""
 
     def script(self, state: np.ndarray) -> Script:
-        """Travel to the corners, descend, take them, carry them on an arch, let go."""
+        """Travel to the corners, descend, grasp them, carry them along an arc, and release."""
         for height in (TRAVEL_HEIGHT, GRASP_HEIGHT):
             while True:
                 goals = corners(state)[:2] + (0.0, 0.0, height)
                 if np.abs(goals - pickers(state)).max() < NEAR:
                     break
                 state = yield go(goals, state, pick=False)
-        while not state[18:20].all():
+        while not holding(state).all():
             state = yield go(pickers(state), state, pick=True)
 
         start, way = pickers(state), corners(state)[2:] - corners(state)[:2]

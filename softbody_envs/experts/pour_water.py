@@ -1,48 +1,50 @@
-"""Bring the spout beside the target's rim, then tilt about it."""
+"""Experts for PourWater and PourWaterAmount: bring the spout to the rim of the target, then tilt the cup about it."""
+
+from typing import Any
 
 import numpy as np
 
 from softbody_envs.sim.cups import WALL
 from softbody_envs.tasks.pour_water import MARGIN, REACH
+from softbody_envs.tasks.pour_water_amount import PourWaterAmountEnv
 
-#: The spout reaches this far over the corner of the zone around the target that the cup may not enter, m.
+#: Distance by which the spout extends over the corner of the zone around the target that the cup may not enter, m.
 OVERHANG = 0.11
-#: Distance kept from that zone, m.
+#: Distance of the cup from that zone, m.
 GAP = 0.01
-#: Tilt per control step, rad, and the tilt at which nothing is left.
+#: Tilt per control step, rad, and tilt at which the cup is empty, rad.
 TILT_RATE = 0.06
 LAST_TILT = 2.4
 #: Tilt per control step near the end of a measured pour, rad.
 SLOWEST_TILT_RATE = 0.015
-
-
-#: What flows now goes on flowing for this many control steps after the cup begins to tilt back.
+#: Control steps for which the present flow continues after the cup begins to tilt back.
 FORESIGHT = 4
-#: What still slips out while the cup tilts back, as a share of all water.
+#: Fraction of the water that leaves the cup while it tilts back, in addition to the flow.
 RESERVE = 0.04
-#: Tilted slowly, the cup loses these shares of its water at about these tilts (rad), whatever its size: the spheres lie in
-#: a lattice that gives way at a certain slope.
-SHARE_LEFT = (0.0, 0.2, 0.5, 0.8, 1.0)
-TILT_THEN = (1.45, 1.6, 1.69, 1.76, 1.82)
-#: The slow part begins this much before, rad.
+#: Fractions of the water that have left a slowly tilted cup of any size, and the tilts at which they have, rad. The spheres
+#: form a lattice, which gives way at a certain slope.
+FRACTIONS_LEFT = (0.0, 0.2, 0.5, 0.8, 1.0)
+TILTS = (1.45, 1.6, 1.69, 1.76, 1.82)
+#: Tilt before the expected one at which slow tilting begins, rad.
 HEADROOM = 0.25
 
 
 class PourWaterExpert:
-    """Pours all of it."""
+    """Pours all the water."""
 
     def reset(self) -> None:
-        """There is nothing to forget."""
+        """Do nothing: the expert has no memory."""
 
     def act(self, state: np.ndarray) -> np.ndarray:
-        """Go to where the spout belongs at the present tilt; once there, tilt on."""
-        position, tilt = state[:2], state[2]
-        half, rim = state[3] / 2 + WALL, state[5] + WALL
-        target_x, target_rim, target_half = state[6], state[7] + WALL, state[8] / 2 + WALL
-        corner = np.array([target_x - target_half - MARGIN, target_rim + MARGIN])
+        """Move to the pouring position for the present tilt. Once there, tilt further."""
+        seen = named(state)
+        position, tilt = np.array([seen["cup x"], seen["cup z"]]), seen["cup tilt"]
+        half, rim = seen["cup inner length"] / 2 + WALL, seen["cup height"] + WALL
+        target_rim, target_half = seen["target height"] + WALL, seen["target inner length"] / 2 + WALL
+        corner = np.array([seen["target x"] - target_half - MARGIN, target_rim + MARGIN])
 
         def place(angle: float) -> np.ndarray:
-            """Where the cup belongs: its spout lies on the wall that leans over the corner, from a quarter turn on level."""
+            """Pouring position: the cup's side lies on a line over the corner, level from a quarter turn on."""
             lean = min(angle, np.pi / 2)
             along, away = np.array([np.sin(lean), np.cos(lean)]), np.array([-np.cos(lean), np.sin(lean)])
             cos, sin = np.cos(angle), np.sin(angle)
@@ -57,25 +59,32 @@ class PourWaterExpert:
         return np.clip(np.array([*offset, tilt_change]) / REACH, -1.0, 1.0)
 
     def tilt_rate(self, state: np.ndarray) -> float:
-        """How far to tilt in this control step, rad."""
+        """Tilt in this control step, rad."""
         return TILT_RATE
 
 
 class PourWaterAmountExpert(PourWaterExpert):
-    """Tilts quickly to just before the wanted share leaves the cup, then little by little, and back as soon as it has left."""
+    """Tilts quickly until shortly before the goal, then in small steps, and back as soon as enough water has left the cup."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what had left the cup."""
+        """Forget how much water has left the cup."""
         self._left = 0.0
 
     def tilt_rate(self, state: np.ndarray) -> float:
-        left, wanted = 1.0 - state[12], state[14]
+        seen = named(state)
+        left, goal = 1.0 - seen["fraction in cup"], seen["target fraction"]
         flow, self._left = left - self._left, left
-        if left + FORESIGHT * flow >= wanted - RESERVE:
+        if left + FORESIGHT * flow >= goal - RESERVE:
             return -REACH[2]
         if flow > 0.0:
             return 0.0
-        return TILT_RATE if state[2] < np.interp(wanted, SHARE_LEFT, TILT_THEN) - HEADROOM else SLOWEST_TILT_RATE
+        expected_tilt = np.interp(goal, FRACTIONS_LEFT, TILTS)
+        return TILT_RATE if seen["cup tilt"] < expected_tilt - HEADROOM else SLOWEST_TILT_RATE
+
+
+def named(state: np.ndarray) -> dict[str, Any]:
+    """Elements of the state vector by their names; PourWater has all but the last two."""
+    return dict(zip(PourWaterAmountEnv.state_names, state, strict=False))

@@ -1,4 +1,4 @@
-"""Take the rope by both ends and pull them apart."""
+"""Expert for StraightenRope: grasp both ends of the rope and pull them apart."""
 
 import numpy as np
 
@@ -6,20 +6,20 @@ from softbody_envs.sim.pickers import REACH
 from softbody_envs.sim.rope import LENGTH
 from softbody_envs.tasks.straighten_rope import LOW
 
-#: A picker grasps when it is this close to its end of the rope, m, and grasps anew when the end is farther away than this.
+#: Distance between picker and end of the rope at which the picker grasps, m. It grasps again if the end is farther away.
 CLOSE = 0.015
-#: Ends nearer to each other than this say nothing about where to pull, m.
+#: Smallest distance between the ends at which it defines the direction of the pull, m.
 APART = 0.01
 
 
 class StraightenRopeExpert:
-    """Each picker goes to the end that is nearer, both grasp, and then they part in the direction in which the ends lie."""
+    """Sends each picker to the closer end. Once both hold, they move apart along the line through the ends."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget which picker is for which end."""
+        """Forget which picker is assigned to which end."""
         self._swapped: bool | None = None
 
     def act(self, state: np.ndarray) -> np.ndarray:
@@ -39,7 +39,7 @@ class StraightenRopeExpert:
 
     @staticmethod
     def _targets(ends: np.ndarray) -> np.ndarray:
-        """Where the ends belong: a rope's length apart, in the middle of the floor."""
+        """Goals of the ends: a rope's length apart, centred at the origin."""
         direction = (ends[1] - ends[0]) * (1.0, 1.0, 0.0)
         distance = np.linalg.norm(direction)
         direction = direction / distance if distance > APART else np.array([0.0, -1.0, 0.0])

@@ -1,1 +1,1 @@
-"""Bullet: one client, and the objects the tasks are made of."""
+"""Simulation: a Bullet world and the objects in it. No other package calls Bullet's physics."""

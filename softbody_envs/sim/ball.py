@@ -1,4 +1,4 @@
-"""A ball that is put where it belongs: the diagnostic tasks have their motion in closed form."""
+"""A ball without physics, for the diagnostic tasks, whose motion has a closed form."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,9 @@ COLOR = (0.85, 0.20, 0.15, 1.0)
 
 class Ball:
     """
-    :param world: what the ball is drawn in; it touches nothing
+    A sphere that is placed at will and collides with nothing.
+
+    :param world: world that the ball is drawn in
     """
 
     def __init__(self, world: World) -> None:
@@ -23,6 +25,8 @@ class Ball:
 
     def move(self, position: Sequence[float] | np.ndarray) -> None:
         """
-        :param position: of the centre, m
+        Place the ball.
+
+        :param position: position of the centre, m
         """
         self._client.resetBasePositionAndOrientation(self._body, position, (0.0, 0.0, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Keeps the line that PyBullet prints when it is imported out of the terminal."""
+"""Suppresses the line that PyBullet prints when it is imported."""
 
 import os
 import tempfile
@@ -13,8 +13,9 @@ def no_banner() -> Iterator[None]:
     """
     Drop PyBullet's banner from standard error during a ``with`` block.
 
-    C code writes it, which ``contextlib.redirect_stderr`` cannot reach. Everything else, from other threads, too, appears
-    when the block ends. Redirecting a file descriptor concerns the whole process: do it once, for the import.
+    The banner is written by C code, which ``contextlib.redirect_stderr`` does not affect. All other output, including that
+    of other threads, is held back and appears when the block ends. Redirecting a file descriptor affects the whole process,
+    so use this for the import only.
     """
     try:
         stderr = os.dup(2)

@@ -10,21 +10,23 @@ from softbody_envs.sim.world import World
 
 #: Nodes along each side. Odd: each corner then has a diagonal spring, and a fold runs along the middle nodes.
 N_SIDE = 9
-#: kg (SoftGym: 0.5). Only the ratio of the springs to it matters.
+#: Mass of the cloth, kg (SoftGym: 0.5). Only the ratio of stiffness to mass matters.
 MASS = 0.5
-#: Of the springs between neighbours, N/m. With ``STEPS_PER_CONTROL`` steps a hanging cloth trembles from 1.5 times this on.
+#: Stiffness of the springs between neighbours, N/m. At 1.5 times this value, ``STEPS_PER_CONTROL`` is too small: a hanging
+#: cloth trembles.
 STIFFNESS = 110.0
-#: Of the springs, N s/m; in all directions, so that a swinging cloth comes to rest within a second, as air would do it.
+#: Damping of the springs, N s/m. It acts in all directions, so that a swinging cloth comes to rest within a second, as in
+#: air.
 DAMPING = 0.05
 BENDING_STIFFNESS = 0.05
 FRICTION = 1.0
-#: Distance that the cloth keeps from what it touches, m.
+#: Contact margin of the cloth, m.
 MARGIN = 0.006
-#: Simulation steps in a control step that these springs need.
+#: Simulation steps per control step; the stiffness needs that many to be stable.
 STEPS_PER_CONTROL = 14
-#: Two held nodes are pulled no further apart than this many times their distance in the flat cloth.
+#: Largest distance of two held nodes, as a multiple of their distance in the flat cloth.
 TETHER = 1.1
-#: The cloth has exploded if an edge is this many times as long as at rest, or a node this far away, m.
+#: The cloth has exploded if an edge is longer than this multiple of its rest length, or a coordinate larger than this, m.
 MAX_STRETCH = 4.0
 MAX_DISTANCE = 3.0
 
@@ -33,9 +35,10 @@ _INDEX = np.arange(N_SIDE**2).reshape(N_SIDE, N_SIDE)
 
 class Cloth:
     """
-    A square mesh whose diagonals alternate. It does not collide with itself, so its layers lie in each other: Bullet
-    shuffles self-collisions by a random number that belongs to the process and that no seed reaches. It is invisible;
-    ``softbody_envs.painting`` draws it.
+    A square mesh with alternating diagonals. It is invisible to Bullet's renderers; ``softbody_envs.painting`` draws it.
+
+    It does not collide with itself, so layers interpenetrate: Bullet shuffles self-collisions with a random generator of
+    the process that cannot be seeded.
 
     :param world: a deformable world
     :param grid: the cloth at rest, flat in any plane, m, ``(N_SIDE, N_SIDE, 3)``
@@ -48,7 +51,7 @@ class Cloth:
         self._edges = _edges()
         self._lengths = self._edge_lengths(self._flat)
         self._anchors: set[int] = set()
-        client.setPhysicsEngineParameter(useSplitImpulse=0)  # a third cheaper
+        client.setPhysicsEngineParameter(useSplitImpulse=0)  # steps are a third cheaper
         with tempfile.TemporaryDirectory() as folder:
             mesh = Path(folder, "cloth.obj")
             mesh.write_text(_obj(self._flat))
@@ -69,42 +72,42 @@ class Cloth:
         self._stay_awake()
 
     def nodes(self) -> np.ndarray:
-        """Positions of the nodes now, m, ``(N_SIDE ** 2, 3)``."""
+        """Positions of the nodes, m, ``(N_SIDE ** 2, 3)``."""
         _, nodes = self._client.getMeshData(self._body, -1, flags=pybullet.MESH_DATA_SIMULATION_MESH)
         return np.array(nodes)
 
     def grid(self) -> np.ndarray:
-        """Positions of the nodes now, m, ``(N_SIDE, N_SIDE, 3)``, in the order they were given in."""
+        """Positions of the nodes, m, ``(N_SIDE, N_SIDE, 3)``, in the order of the constructor's grid."""
         return self.nodes().reshape(N_SIDE, N_SIDE, 3)
 
     def hold(self, node: int, body: int) -> int:
-        """Tie a node to a body, at the offset they have now; return a handle for ``release``."""
+        """Anchor a node to a body at its present offset and return a handle for ``release``."""
         anchor = self._client.createSoftBodyAnchor(self._body, node, body, -1)
         self._anchors.add(anchor)
         return anchor
 
     def release(self, handle: int) -> None:
-        """Untie what ``hold`` tied."""
-        # Bullet never forgets an anchor: removing one twice would free whatever holds its node by then.
+        """Remove an anchor."""
+        # Bullet keeps the ids of removed anchors: removing one twice would free a later anchor of the same node.
         self._anchors.remove(handle)
         self._client.removeConstraint(handle)
 
     def tether(self, first: int, second: int) -> float:
-        """How far apart two held nodes may be pulled, m."""
+        """Largest distance to which two held nodes may be pulled apart, m."""
         return TETHER * float(np.linalg.norm(self._flat[first] - self._flat[second]))
 
     def calm(self) -> None:
-        """Advance by one simulation step and take away all velocities: Bullet does so where a cloth sleeps."""
+        """Advance by one simulation step and set all velocities to zero, as Bullet does for a sleeping cloth."""
         self._client.changeDynamics(self._body, -1, activationState=pybullet.ACTIVATION_STATE_SLEEP)
         self._world.step()
         self._stay_awake()
 
     def stretch(self) -> np.ndarray:
-        """Length of each edge now over its length at rest, ``(n_edges,)``."""
+        """Length of each edge divided by its rest length, ``(n_edges,)``."""
         return self._edge_lengths(self.nodes()) / self._lengths
 
     def fault(self) -> str | None:
-        """What shows that the cloth has exploded, or ``None``: Bullet raises nothing and may give no NaN."""
+        """Describe how the cloth has exploded, or return ``None``. Bullet reports nothing, and positions may be finite."""
         nodes = self.nodes()
         farthest = np.abs(nodes).max()
         if not farthest <= MAX_DISTANCE:
@@ -116,18 +119,18 @@ class Cloth:
         return np.linalg.norm(nodes[self._edges[:, 0]] - nodes[self._edges[:, 1]], axis=1)
 
     def _stay_awake(self) -> None:
-        """A sleeping cloth ignores anchors and contacts."""
+        """Keep the cloth from falling asleep: a sleeping cloth ignores anchors and contacts."""
         self._client.changeDynamics(self._body, -1, activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING)
 
 
 def flat_grid(length: float, width: float, yaw: float = 0.0) -> np.ndarray:
     """
-    A flat cloth on the floor, its middle over the origin.
+    Return the nodes of a flat cloth on the floor, centred at the origin.
 
-    :param length: along the first axis of the grid, m
-    :param width: along the second, m
-    :param yaw: from x to the first axis, rad
-    :return: m, ``(N_SIDE, N_SIDE, 3)``
+    :param length: side along the first axis of the grid, m
+    :param width: side along the second axis, m
+    :param yaw: angle from x to the first axis, rad
+    :return: positions, m, ``(N_SIDE, N_SIDE, 3)``
     """
     along, across = np.meshgrid(*(size * np.linspace(-0.5, 0.5, N_SIDE) for size in (length, width)), indexing="ij")
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -135,7 +138,7 @@ def flat_grid(length: float, width: float, yaw: float = 0.0) -> np.ndarray:
 
 
 def _triangles() -> np.ndarray:
-    """Node numbers, ``(n, 3)``; seen from the normal's side, counterclockwise."""
+    """Node indices of the triangles, ``(n, 3)``, counterclockwise seen from the side of the normal."""
     corner = _INDEX[:-1, :-1], _INDEX[1:, :-1], _INDEX[1:, 1:], _INDEX[:-1, 1:]
     a, b, c, d = (numbers.ravel() for numbers in corner)
     even = (np.add.outer(np.arange(N_SIDE - 1), np.arange(N_SIDE - 1)) % 2 == 0).ravel()
@@ -145,13 +148,13 @@ def _triangles() -> np.ndarray:
 
 
 def _edges() -> np.ndarray:
-    """Pairs of node numbers that a triangle joins, each pair once, ``(n, 2)``."""
+    """Node indices of the edges, each edge once, ``(n, 2)``."""
     triangles = _triangles()
     pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
 def _obj(nodes: np.ndarray) -> str:
-    """A Wavefront file of the cloth."""
+    """Content of a Wavefront file of the cloth."""
     vertices = "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in nodes)
     return vertices + "".join(f"f {a} {b} {c}\n" for a, b, c in _triangles() + 1)

@@ -1,4 +1,4 @@
-"""Open boxes that hold water: what is inside one, and how one is moved without launching its content."""
+"""Cups: open boxes that hold water and are moved without throwing it out."""
 
 from dataclasses import dataclass
 
@@ -16,9 +16,9 @@ class CupSize:
     """
     Inner size of a cup. The cup's frame has its origin in the middle of the underside, z toward the opening.
 
-    :param length: along x, m
-    :param width: along y, m
-    :param height: of the cavity, m
+    :param length: inner length along x, m
+    :param width: inner width along y, m
+    :param height: height of the cavity, m
     """
 
     length: float
@@ -27,21 +27,25 @@ class CupSize:
 
     @property
     def outer_length(self) -> float:
-        """Along x, walls included, m."""
+        """Length along x, walls included, m."""
         return self.length + 2 * WALL
 
     @property
     def outer_height(self) -> float:
-        """From the underside to the rim, m."""
+        """Height from the underside to the rim, m."""
         return self.height + WALL
 
 
 class Cup:
     """
-    A cup that is moved by its pose alone: kinematic, of five boxes, drawn without its front (TinyRenderer has no
-    transparency; the collision shape is closed).
+    A kinematic cup made of five boxes. It is drawn without its front, since TinyRenderer has no transparency; the collision
+    shape is closed.
 
-    :param foot: how far the floor reaches below the underside, m
+    :param world: world that the cup is created in
+    :param size: inner size
+    :param x: position along x, m
+    :param color: RGBA in [0, 1]
+    :param foot: depth to which the floor reaches below the underside, m
     """
 
     def __init__(self, world: World, size: CupSize, x: float, color: tuple[float, float, float, float], foot: float = 0.0):
@@ -74,12 +78,12 @@ class Cup:
 
     def move(self, x: float, z: float, angle: float) -> None:
         """
-        Go to a pose within one simulation step.
+        Move to a pose during the next simulation step.
 
-        The velocity goes with it: from the pose alone the contact solver sees a wall that jumps, and throws the water.
+        The matching velocity is set, too: without it, the contact solver sees walls that jump, and throws the water.
 
-        :param x: of the underside's middle, m
-        :param z: of the underside's middle, m
+        :param x: x of the middle of the underside, m
+        :param z: z of the middle of the underside, m
         :param angle: tilt toward +x, rad
         """
         rate = 1 / self._world.time_step
@@ -92,7 +96,9 @@ class Cup:
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """
-        :param points: m, ``(n, 3)``
+        Transform points to the cup's frame.
+
+        :param points: points in the world, m, ``(n, 3)``
         :return: the same points in the cup's frame, m, ``(n, 3)``
         """
         x, y, z = (points - (self.x, 0.0, self.z)).T
@@ -101,11 +107,11 @@ class Cup:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """
-        Which points lie in the cavity, however the cup is tilted. Half a wall counts as cavity, as in SoftGym: a particle
-        that hits the wall is a little inside it for a moment.
+        Test which points lie in the cavity, at any tilt. Half of each wall counts as cavity, as in SoftGym: a particle that
+        hits a wall penetrates it a little for a moment.
 
-        :param points: m, ``(n, 3)``
-        :return: bool ``(n,)``
+        :param points: points in the world, m, ``(n, 3)``
+        :return: mask, bool ``(n,)``
         """
         x, y, z = np.abs(self.local(points) - (0.0, 0.0, WALL + self.size.height / 2)).T
         half = np.array([self.size.length, self.size.width, self.size.height]) / 2 + WALL / 2
@@ -114,9 +120,9 @@ class Cup:
 
 def corners(size: CupSize, x: np.ndarray | float, z: np.ndarray | float, angle: np.ndarray | float) -> np.ndarray:
     """
-    The outer rectangle of a cup in the x-z plane, for one pose or for arrays of them.
+    Return the corners of a cup's outer rectangle in the x-z plane, for one pose or for arrays of poses.
 
-    :return: m, ``(..., 4, 2)``, in the order of the outline
+    :return: corners, m, ``(..., 4, 2)``, in the order of the outline
     """
     half, top = size.outer_length / 2, size.outer_height
     along, up = np.array([(-half, 0.0), (half, 0.0), (half, top), (-half, top)]).T
@@ -127,10 +133,10 @@ def corners(size: CupSize, x: np.ndarray | float, z: np.ndarray | float, angle: 
 
 def overlap(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """
-    Whether convex outlines touch (separating-axis test).
+    Test whether convex polygons touch (separating-axis theorem).
 
-    :param first: ``(..., n, 2)``
-    :param second: ``(m, 2)``
+    :param first: vertices, ``(..., n, 2)``
+    :param second: vertices, ``(m, 2)``
     :return: bool ``(...)``
     """
     second = np.broadcast_to(second, (*first.shape[:-2], *second.shape))

@@ -1,4 +1,4 @@
-"""Pickers: spheres that move freely, take hold of the nearest node of a rope or a cloth, and let it go."""
+"""Pickers: spheres that move freely, grasp the nearest node of a rope or a cloth, and release it."""
 
 from typing import Protocol
 
@@ -7,52 +7,52 @@ import pybullet
 
 from softbody_envs.sim.world import GRAVITY, World
 
-#: Farthest that a picker moves along each axis in one control step, m, and the sub-steps it takes (SoftGym: 8 of 0.01 m).
+#: Largest move of a picker along each axis in one control step, m, and the number of sub-steps (SoftGym: 8 of 0.01 m).
 REACH = 0.08
 SUBSTEPS = 8
-#: A picker's body, kg. What it holds can hold it back: the force that brings it to the end of a sub-step of t seconds is at
-#: most ``MASS * (LAG + move) / t**2``, enough to lift a rope and too little to stretch it.
+#: Mass of a picker, kg. It limits the force on a held object to ``MASS * (LAG + move) / t**2`` in a sub-step of t seconds:
+#: enough to lift a rope, too little to stretch it.
 MASS = 0.007
-#: How far a picker may fall behind where it was sent, m; it does not catch up on more.
+#: Largest distance by which a picker may lag behind its target, m. It does not make up for more.
 LAG = 0.018
-#: One colour a picker, and the shade it takes while it holds something.
+#: Colours of the pickers, and darker ones while they hold something.
 COLORS = ((0.85, 0.20, 0.15, 1.0), (0.15, 0.60, 0.20, 1.0))
 HOLDING_COLORS = ((0.40, 0.05, 0.03, 1.0), (0.02, 0.25, 0.05, 1.0))
 
 
 class Graspable(Protocol):
-    """What pickers can hold."""
+    """An object that pickers can hold."""
 
     def nodes(self) -> np.ndarray:
-        """Positions of the nodes now, m, ``(n, 3)``."""
+        """Positions of the nodes, m, ``(n, 3)``."""
 
     def hold(self, node: int, body: int) -> int:
-        """Tie a node to a body, at the offset they have now; return a handle for ``release``."""
+        """Attach a node to a body at its present offset and return a handle for ``release``."""
 
     def release(self, handle: int) -> None:
-        """Untie what ``hold`` tied."""
+        """Detach what ``hold`` attached."""
 
     def tether(self, first: int, second: int) -> float:
-        """How far apart two held nodes may be pulled, m."""
+        """Largest distance to which two held nodes may be pulled apart, m."""
 
 
 class Pickers:
     """
-    Two pickers, SoftGym's way: an action is ``(dx, dy, dz, pick)`` for each, ``pick > 0`` grasps and holds.
+    Two pickers as in SoftGym: an action is ``(dx, dy, dz, pick)`` for each, and ``pick > 0`` grasps or holds.
 
-    A picker takes the nearest free node within its range and keeps the offset it had. Pickers push nothing. They are
-    not infinitely strong: one that holds what cannot follow stays behind, and two that hold the same thing cannot
-    be sent farther apart than its ``tether``.
+    A picker grasps the nearest free node in range and keeps its offset to it. Pickers push nothing. Their force is limited:
+    a picker lags behind if the held object cannot follow, and two pickers that hold the same object cannot move farther
+    apart than its ``tether``.
 
-    :param world: what the pickers' bodies are made in
-    :param target: what they can hold
-    :param positions: of their centres at first, m, ``(2, 3)``
-    :param low: corner of the box their centres stay in, m
-    :param high: opposite corner, m
-    :param radius: of the spheres, m
-    :param grasp_range: farthest node that can be taken, m from the centre
-    :param mass: of a picker, kg: a heavy one goes where it is sent whatever it holds
-    :param reach: farthest that a picker moves along each axis in one control step, m
+    :param world: world that the pickers are created in
+    :param target: object that they can hold
+    :param positions: initial positions of the centres, m, ``(2, 3)``
+    :param low: lowest corner of the box that the centres stay in, m
+    :param high: highest corner of the box, m
+    :param radius: radius of the spheres, m
+    :param grasp_range: largest distance from the centre to a node that can be grasped, m
+    :param mass: mass of a picker, kg; a heavy picker moves as commanded, whatever it holds
+    :param reach: largest move of a picker along each axis in one control step, m
     """
 
     def __init__(
@@ -69,17 +69,18 @@ class Pickers:
     ) -> None:
         self._world = world
         self._target = target
-        #: Centres now, m, ``(2, 3)``, and where they were last sent.
+        #: Centres, m, ``(2, 3)``.
         self.positions = np.array(positions, dtype=np.float64)
+        # Targets of the last sub-step.
         self._sent = self.positions.copy()
         self._low, self._high = np.asarray(low), np.asarray(high)
         self._grasp_range = grasp_range
         self._reach = reach
         self._interval = max(1, world.steps_per_control // SUBSTEPS)
-        # Falling and being lifted again, a picker ends each sub-step at the height it was sent to.
+        # Compensates gravity: a picker ends each sub-step at the height of its target.
         self._lift = np.array([0.0, 0.0, -GRAVITY * world.time_step * (self._interval + 1) / 2])
         self._bodies = [self._create(mass, position, color, radius) for position, color in zip(positions, COLORS, strict=True)]
-        #: The node that each picker holds, or ``None``.
+        #: Node that each picker holds, or ``None``.
         self.held: list[int | None] = [None] * len(self._bodies)
         self._handles: list[int] = [-1] * len(self._bodies)
         self._offsets = np.zeros_like(self.positions)
@@ -93,9 +94,9 @@ class Pickers:
 
     def control(self, action: np.ndarray) -> None:
         """
-        Advance the world by one control step while the pickers carry out an action.
+        Advance the world by one control step while the pickers execute an action.
 
-        :param action: ``(dx, dy, dz, pick)`` of each picker in turn, in [-1, 1]
+        :param action: ``(dx, dy, dz, pick)`` of each picker in turn, in [-1, 1], ``(8,)``
         """
         commands = action.reshape(len(self._bodies), 4)
         picks = commands[:, 3] > 0.0
@@ -112,14 +113,14 @@ class Pickers:
             self._locate()
 
     def _release(self, picker: int) -> None:
-        """Let go of what a picker holds, if anything."""
+        """Release the node that a picker holds, if any."""
         if self.held[picker] is not None:
             self._target.release(self._handles[picker])
             self.held[picker] = None
             self._paint(picker, COLORS)
 
     def _grasp(self, picks: np.ndarray) -> None:
-        """Let each picker that wants to and is empty take the nearest free node in range."""
+        """Let each empty picker that is commanded to grasp take the nearest free node in range."""
         empty = [picker for picker, pick in enumerate(picks) if pick and self.held[picker] is None]
         if not empty:
             return
@@ -136,7 +137,7 @@ class Pickers:
                 self._paint(picker, HOLDING_COLORS)
 
     def _send(self, move: np.ndarray) -> None:
-        """Give the pickers the velocities that bring them, if nothing holds them back, to the end of a sub-step's move."""
+        """Set the velocities that move unhindered pickers by ``move`` in one sub-step."""
         there = np.clip(self._sent + move, self._low, self._high)
         first, second = self.held
         if first is not None and second is not None:
@@ -150,7 +151,7 @@ class Pickers:
             self._world.client.resetBaseVelocity(body, velocity, (0.0, 0.0, 0.0))
 
     def _restrained(self, there: np.ndarray, tether: float) -> np.ndarray:
-        """Where the pickers go instead, each giving way by half, so that the held nodes stay within their tether."""
+        """Move both targets toward each other, by the same distance, until the held nodes are within their tether."""
         first, second = there + self._offsets
         distance = np.sqrt(((second - first) ** 2).sum())
         if distance <= tether:
@@ -159,7 +160,7 @@ class Pickers:
         return np.clip(there + np.stack([give, -give]), self._low, self._high)
 
     def remove(self) -> None:
-        """Let go and take the pickers out of the world."""
+        """Release everything and remove the pickers from the world."""
         for picker, body in enumerate(self._bodies):
             self._release(picker)
             self._world.client.removeBody(body)

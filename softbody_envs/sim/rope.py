@@ -15,12 +15,12 @@ SPACING = LENGTH / N_SEGMENTS
 RADIUS = 0.009
 #: Mass of a segment, kg.
 SEGMENT_MASS = 0.005
-#: Simulation steps in a control step: fewer, and fast pulls stretch the rope.
+#: Simulation steps per control step. With fewer, fast pulls stretch the rope.
 STEPS_PER_CONTROL = 56
-#: SoftGym's rope colour, and that of the first and the last segment: in a heap an end looks like a bend.
+#: SoftGym's rope colour, and the colour of the end segments: without it, ends in a heap look like bends.
 COLOR = (0.0, 0.5, 1.0, 1.0)
 END_COLOR = (1.0, 0.8, 0.0, 1.0)
-#: A rope stretched or shrunk by more than this fraction, or further away, m, has exploded.
+#: The simulation has failed if the length differs by more than this fraction, or a coordinate is larger than this, m.
 MAX_STRETCH = 0.2
 MAX_DISTANCE = 2.0
 
@@ -29,19 +29,20 @@ _HALF = np.array([0.0, 0.0, SPACING / 2])
 
 class Rope:
     """
-    Each segment is a sphere that collides, drawn as a capsule as long as the segment; point-to-point constraints join
-    the ends. Nodes are the joints and the two free ends. Spheres closer than their diameter do not pass through each
-    other, and neighbours touch when the rope bends by 88 degrees at a joint.
+    Segments that collide as spheres, are drawn as capsules and are joined by point-to-point constraints.
 
-    :param world: a rigid world
-    :param nodes: m, ``(N_NODES, 3)``, neighbours ``SPACING`` apart
+    Nodes are the joints and the two free ends. The spheres are dense enough that parts of the rope do not pass through each
+    other. Neighbouring spheres touch if the rope bends by 88 degrees at a joint.
+
+    :param world: rigid world
+    :param nodes: initial positions, m, ``(N_NODES, 3)``, neighbours ``SPACING`` apart
     """
 
     def __init__(self, world: World, nodes: np.ndarray) -> None:
         self._world = world
         client = world.client
-        # Much damping, for a segment that spins fast leaves its joints in one step; stiff joints pull it back at once.
-        # Neighbours are 7 mm apart: from Bullet's 2 cm on, each would be a contact that never touches.
+        # Strong damping and stiff joints: a segment that spins fast would leave its joints within one step. The contact
+        # threshold is below the gap of 7 mm between neighbours: Bullet's default of 2 cm would make each pair a contact.
         client.setPhysicsEngineParameter(numSolverIterations=10, erp=1.0, contactBreakingThreshold=0.004)
         shape = client.createCollisionShape(pybullet.GEOM_SPHERE, radius=RADIUS)
         look, end_look = (
@@ -65,7 +66,7 @@ class Rope:
             client.createConstraint(first, -1, second, -1, pybullet.JOINT_POINT2POINT, (0, 0, 0), _HALF, -_HALF)
 
     def nodes(self) -> np.ndarray:
-        """Positions of the nodes now, m, ``(N_NODES, 3)``; a joint is the middle between the two ends that meet there."""
+        """Positions of the nodes, m, ``(N_NODES, 3)``. A joint is the midpoint of the two ends that meet there."""
         get = self._world.client.getBasePositionAndOrientation
         poses = [get(segment) for segment in self._segments]
         centres = np.array([position for position, _ in poses])
@@ -75,7 +76,7 @@ class Rope:
         return np.concatenate([starts[:1], (ends[:-1] + starts[1:]) / 2, ends[-1:]])
 
     def hold(self, node: int, body: int) -> int:
-        """Tie a node to a body, at the offset they have now; return a handle for ``release``."""
+        """Constrain a node to a body at its present offset and return a handle for ``release``."""
         client = self._world.client
         segment, pivot = (node, -_HALF) if node < N_SEGMENTS else (N_SEGMENTS - 1, _HALF)
         position, orientation = client.getBasePositionAndOrientation(segment := self._segments[segment])
@@ -86,34 +87,37 @@ class Rope:
         )
 
     def release(self, handle: int) -> None:
-        """Untie what ``hold`` tied."""
+        """Remove a constraint."""
         self._world.client.removeConstraint(handle)
 
     def tether(self, first: int, second: int) -> float:
-        """How far apart two held nodes may be pulled, m: the rope between them."""
+        """Largest distance to which two held nodes may be pulled apart, m: the length of the rope between them."""
         return abs(first - second) * SPACING
 
 
 def length(nodes: np.ndarray) -> float:
     """
-    :param nodes: m, ``(n, 3)``
-    :return: length of the line through them, m
+    Return the length of the line through the nodes, m.
+
+    :param nodes: positions, m, ``(n, 3)``
     """
     return float(np.linalg.norm(np.diff(nodes, axis=0), axis=1).sum())
 
 
 def end_distance(nodes: np.ndarray) -> float:
     """
-    :param nodes: m, ``(n, 3)``
-    :return: distance between the first and the last, m
+    Return the distance between the first and the last node, m.
+
+    :param nodes: positions, m, ``(n, 3)``
     """
     return float(np.linalg.norm(nodes[-1] - nodes[0]))
 
 
 def failure(nodes: np.ndarray) -> str | None:
     """
-    :param nodes: m, ``(n, 3)``
-    :return: what shows that the simulation has failed, or ``None``
+    Describe how the simulation has failed, or return ``None``.
+
+    :param nodes: positions, m, ``(n, 3)``
     """
     if not np.isfinite(nodes).all() or np.abs(nodes).max() > MAX_DISTANCE:
         return "the rope has left the scene"
@@ -123,7 +127,7 @@ def failure(nodes: np.ndarray) -> str | None:
 
 
 def _orientation(axis: np.ndarray) -> np.ndarray:
-    """The shortest rotation that turns z to an axis, as a quaternion (x, y, z, w)."""
+    """Shortest rotation from z to an axis, as a quaternion (x, y, z, w)."""
     x, y, z = axis / np.linalg.norm(axis)
     if z < -1 + 1e-9:
         return np.array([1.0, 0.0, 0.0, 0.0])

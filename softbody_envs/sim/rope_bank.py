@@ -1,7 +1,7 @@
 """
-The crumpled ropes that episodes start from.
+Crumpled ropes that episodes start from.
 
-``python -m softbody_envs.sim.rope_bank`` makes them anew (15 minutes) and overwrites the file that the package ships.
+``python -m softbody_envs.sim.rope_bank`` generates them again (15 minutes) and overwrites the file in the package.
 """
 
 from functools import cache
@@ -16,21 +16,22 @@ from softbody_envs.sim.world import World
 from softbody_envs.variations import N_VARIATIONS, variation_rng
 
 PATH = files("softbody_envs.sim") / "rope_bank.npz"
-#: Positions are kept as whole multiples of this, m.
+#: Positions are stored as integer multiples of this, m.
 RESOLUTION = 1e-5
-#: SoftGym's recipe: so often, some node is pulled for 0.64 s at up to 0.5 m/s to the sides and 1 m/s upward, then dropped.
+#: As in SoftGym, a random node is pulled this many times, for 0.64 s at up to 0.5 m/s sideways and 1 m/s upward, and
+#: dropped.
 PULLS = 4
 PULL_STEPS = 8
 PULL_SPEED = 0.04
 DROP_STEPS = 12
-#: At rest, no node moves farther than this in one control step, m; a rope that takes longer is drawn again.
+#: Largest motion of a node in one control step for a rope at rest, m. A rope that takes longer to rest is rejected.
 REST = 2e-4
 MAX_SETTLE_STEPS = 100
-#: The ends of a start are at most so far apart, m, or there would be little to straighten.
+#: Largest distance between the ends, m: otherwise there would be little to straighten.
 MAX_END_DISTANCE = 0.35
-#: No node of it is farther from the middle, m: however it is turned, the pickers reach all of it.
+#: Largest distance of a node from the middle, m: the pickers reach all of the rope at any orientation.
 MAX_EXTENT = 0.25
-#: Nothing lies on its ends: so far around them, m, no other part of the rope is higher.
+#: Radius around each end in which no other part of the rope may be higher, m: nothing lies on the ends.
 CLEARANCE = 1.5 * RADIUS
 
 
@@ -42,9 +43,11 @@ def _bank() -> np.ndarray:
 
 def crumpled(variation: int, rng: np.random.Generator) -> np.ndarray:
     """
+    Return the nodes of a rope at rest on the floor, with its bounding box centred on the z axis.
+
     :param variation: 0..999
-    :param rng: draws the turn about the z axis
-    :return: nodes of a rope at rest on the floor, its bounding box centred on the z axis, m, ``(N_NODES, 3)``
+    :param rng: generator of the rotation about the z axis
+    :return: positions, m, ``(N_NODES, 3)``
     """
     nodes = _bank()[variation] * RESOLUTION
     cos, sin = np.cos(yaw := rng.uniform(-np.pi, np.pi)), np.sin(yaw)
@@ -52,16 +55,16 @@ def crumpled(variation: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _centred(nodes: np.ndarray) -> np.ndarray:
-    """The same rope with its bounding box centred on the z axis."""
+    """Centre the bounding box of a rope on the z axis."""
     middle = (nodes.min(axis=0) + nodes.max(axis=0)) / 2
     return nodes - middle * (1.0, 1.0, 0.0)
 
 
 def crumple(world: World, rng: np.random.Generator) -> np.ndarray | None:
     """
-    Empty a world, lay a straight rope in it and pull it about.
+    Clear a world, lay a straight rope in it and pull it at random nodes.
 
-    :return: nodes of a rope at rest, centred, m, ``(N_NODES, 3)``, or ``None`` if what came out is no good start
+    :return: nodes of the rope at rest, centred, m, ``(N_NODES, 3)``, or ``None`` if it is rejected
     """
     world.clear()
     world.add_floor()
@@ -87,7 +90,7 @@ def crumple(world: World, rng: np.random.Generator) -> np.ndarray | None:
 
 
 def _settle(world: World, rope: Rope) -> np.ndarray | None:
-    """Wait until the rope is at rest; return its nodes, or ``None`` if that takes too long."""
+    """Simulate until the rope is at rest. Return its nodes, or ``None`` if that takes too long."""
     before = rope.nodes()
     for _ in range(MAX_SETTLE_STEPS):
         for _ in range(world.steps_per_control):
@@ -100,7 +103,7 @@ def _settle(world: World, rope: Rope) -> np.ndarray | None:
 
 
 def _shows_its_ends(nodes: np.ndarray) -> bool:
-    """Whether both ends are seen from above."""
+    """Test whether both ends are visible from above."""
     for line in (nodes, nodes[::-1]):
         end = line[0]
         others = np.concatenate([line[2:], (line[2:] + line[1:-1]) / 2])
@@ -111,7 +114,7 @@ def _shows_its_ends(nodes: np.ndarray) -> bool:
 
 
 def main() -> None:
-    """Make the bank."""
+    """Generate and store the ropes."""
     bank = np.empty((N_VARIATIONS, N_NODES, 3), dtype=np.int16)
     world = World(STEPS_PER_CONTROL)
     for variation in trange(N_VARIATIONS):

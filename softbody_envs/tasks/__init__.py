@@ -1,1 +1,1 @@
-"""One file a task: its scene, actions, state, performance and reward."""
+"""Tasks, one per file: scene, reward, state vector and camera. Each class docstring is the page of its task."""

@@ -1,4 +1,4 @@
-"""DropFoldCloth: lay a hanging cloth on the floor, folded in half."""
+"""DropFoldCloth: lower a hanging cloth to the floor, folded in half."""
 
 from typing import ClassVar
 
@@ -10,17 +10,17 @@ from softbody_envs.sim.pickers import REACH
 from softbody_envs.sim.world import World
 from softbody_envs.tasks.fold_cloth import N_HALF, PICKER_RADIUS, SIZES, FoldClothEnv
 
-#: The pickers hold the two upper corners from this far above, m.
+#: Initial height of the pickers above the corners that they hold, m.
 GRIP_HEIGHT = 0.05
-#: Farthest that a picker moves along each axis in one control step, m.
+#: Largest move of a picker along each axis in one control step, m.
 PICKER_REACH = 0.03
-#: Height of the lower edge at first, m, before its weight stretches the cloth by some 3.5 cm.
+#: Range of the initial height of the lower edge, m, before the weight stretches the cloth by about 3.5 cm.
 DROP_HEIGHTS = (0.03, 0.05)
-#: Greatest angle between the direction of the fold and x, rad.
+#: Largest angle between the direction of the fold and x, rad.
 YAW = np.pi / 6
-#: Control steps after which the cloth hangs still; each ends with its velocities taken away.
+#: Control steps before an episode in which the cloth comes to rest; its velocities are set to zero after each.
 SETTLE_STEPS = 5
-#: How many points of each side of the cloth the state shows.
+#: Number of points on each side of the cloth in the state vector.
 N_POINTS = 5
 
 
@@ -28,19 +28,25 @@ class DropFoldClothEnv(FoldClothEnv):
     """
     ## Description
 
-    A cloth hangs from two pickers that hold its upper corners; its lower edge just touches the floor. Lay it on the floor,
-    folded in half: the lower edge stays where it is, the lower half goes behind it (toward -x), and the upper half on the
-    lower.
+    A cloth hangs from two pickers that hold its upper corners. Its lower edge is at the floor. Lay the cloth on the floor,
+    folded in half: the lower edge stays where it is, the lower half lies behind it (toward -x), and the upper half lies on
+    the lower half.
 
-    The cloth and the pickers are those of `FoldCloth-v0`.
+    Cloth and pickers are those of `FoldCloth-v0`.
 
     ## Action Space
 
-    `Box(-1, 1, (8,), float32)`, as in `FoldCloth-v0`: x, y, z and pick of picker 0, then of picker 1. The pickers hold
-    the cloth at first; the first action decides whether they keep it: a pick of 0 or less drops it. A picker moves 0.03 m
-    in one step. With `keep_hold=True` neither ever lets go, whatever elements 3 and 7 say.
+    `Box(-1, 1, (8,), float32)`, for one control step of 0.08 s, as in `FoldCloth-v0` with smaller moves:
 
-    The centres of the pickers stay within x = -0.6 to 0.3 m, y = -0.45 to 0.45 m and z = 0.05 to 0.85 m.
+    | Num | Action | Meaning |
+    |-----|--------|---------|
+    | 0, 1, 2 | move picker 0 along x, y, z | 0.03 m in one step |
+    | 3 | pick | above 0: hold, or grasp the nearest free node within 6.1 cm of the centre; otherwise: release |
+    | 4, 5, 6 | move picker 1 along x, y, z | 0.03 m in one step |
+    | 7 | pick | as 3 |
+
+    The pickers hold the cloth at the start. If the pick of the first action is 0 or less, the cloth drops. The centres of
+    the pickers stay within x = -0.6 to 0.3 m, y = -0.45 to 0.45 m and z = 0.05 to 0.85 m.
 
     ## Observation Space
 
@@ -51,67 +57,68 @@ class DropFoldClothEnv(FoldClothEnv):
     | 0 to 5 | x, y, z of the two upper corners | m |
     | 6 to 11 | x, y, z of the lower corners, in the same order | m |
     | 12 to 17 | x, y, z of picker 0, then of picker 1 | m |
-    | 18, 19 | whether picker 0, picker 1 holds the cloth | 0 or 1 |
-    | 20 to 25 | x, y, z of the upper corner of each picker, seen from that picker | 0.08 m |
-    | 26 to 31 | x, y, z of the lower corners, seen from the upper ones | 0.08 m |
-    | 32 to 46 | x, y, z of five points of one side, from the upper corner to the lower, seen from the place of that | 0.08 m |
-    | 47 to 61 | the same of the other side | 0.08 m |
+    | 18, 19 | whether picker 0 and picker 1 hold the cloth | 0 or 1 |
+    | 20 to 25 | x, y, z of each picker's upper corner relative to that picker | 0.08 m |
+    | 26 to 31 | x, y, z of the lower corners relative to the upper ones | 0.08 m |
+    | 32 to 46 | x, y, z of five points of one side, from upper to lower corner, relative to the lower one's goal | 0.08 m |
+    | 47 to 61 | the same for the other side | 0.08 m |
 
-    Elements are clipped at their bounds: what is farther than 0.8 m, elements 20 to 61 do not tell.
+    Elements are clipped to the bounds, elements 20 to 61 therefore at 0.8 m.
 
     ## Rewards
 
-    Each step: -(d + 7 f). d is the mean distance between a node of the upper half and its mirror image in the lower half,
-    f the mean distance of the lower half's nodes from where they belong on the floor, both in m and both horizontal, as
-    seen from above. The middle row of nodes counts in neither.
+    Each step: -(d + 7 f), where d is the mean distance between a node of the upper half and its mirror image in the lower
+    half, and f is the mean distance of the lower half's nodes from their goals on the floor. Both distances are horizontal,
+    in m. The middle row of nodes belongs to neither half.
 
-    `performance` is this reward; `normalized_performance` = 1 - performance / initial performance; `is_success` from 0.9
-    on; `monotone` is minus the distance between the halves in space, m.
+    | `info` key | Meaning |
+    |------------|---------|
+    | `performance` | the reward |
+    | `normalized_performance` | 1 - performance / initial |
+    | `is_success` | `normalized_performance` is at least 0.9 |
+    | `monotone` | minus the mean distance between the halves in space, m |
 
-    Holding the cloth still scores 0, and so, on average, does letting go. A cloth that is dropped in a heap on the best
-    place can reach 0.33, one that is laid out up to a quarter of its length or to the fold while the rest stands there
-    0.76 (calculated from ideal poses).
+    Holding the cloth still scores 0, and so does releasing it, on average. Dropping the cloth in a heap at the best place
+    scores up to 0.33. Laying out a quarter of its length, or the lower half, while the rest stands upright scores 0.76
+    (calculated for ideal poses).
 
     ## Starting State
 
-    The cloth at rest, its lower edge on the floor or up to 1 cm above it, its plane through the z axis. A variation draws
-    how high it hangs (from a range of 2 cm), both sides of the cloth (0.38 to 0.54 m) and the angle between the direction
-    of the fold and x (up to 30 degrees either way).
+    The cloth hangs at rest in a plane through the z axis, with its lower edge on the floor or up to 1 cm above it.
+    Variations differ in the height of the cloth (within 2 cm), in both of its side lengths (0.38 to 0.54 m) and in the
+    angle between the direction of the fold and x (-30 to 30 degrees).
 
     ## Episode End
 
-    Truncation after 100 steps (8 s). There is no termination. Should the simulation fail (an edge of more than 4 times
-    its length), the episode is truncated with `info["sim_error"]`, and the next one starts in a new world.
+    Truncation after 100 steps (8 s). There is no termination. If the simulation fails (an edge is longer than 4 times
+    its rest length), the episode is truncated with `info["sim_error"]`, and the next one starts in a new world.
 
     ## Arguments
 
     See `SoftbodyEnv`, and
 
-    * `keep_hold` (default `False`): the pickers hold the cloth for the whole episode; what is left to decide is where they
-      go. The cloth can be folded without letting go.
+    * `keep_hold` (default `False`): pickers hold the cloth for the whole episode, regardless of actions 3 and 7. Only the
+      motion of the pickers remains to be learned. The task can be solved without releasing.
 
     ## Differences from SoftGym
 
-    In SoftGym a perfect fold on the floor scores less than holding the cloth still: the lower half is to stay where it
-    was at reset, in the air. And the pickers cannot reach the floor. Repaired:
+    In SoftGym a perfect fold on the floor scores less than holding the cloth still, because the goal of the lower half is
+    its position at reset, in the air. The pickers cannot reach the floor either. Therefore:
 
-    * The lower half belongs flat on the floor.
-    * Distances are horizontal. In space, letting go would score 0.7, since a heap on the floor is nearer to everything
-      than a cloth in the air.
-    * The lower half weighs 7, not 1.2: with less than 7 a cloth whose lower half is laid out would score less than one
-      of which a quarter is (with 1.2 -0.37 and 0.43), and a learner would stop there.
-    * The pickers reach the floor, and they hold the cloth at the start instead of only being near it.
-    * The lower edge is at the floor at first. Higher up, the first steps of the way to the fold score nothing, and to carry
-      the cloth forward in the air scores 0.33 and leads nowhere.
-    * Pickers move 0.03 m in one step, not 0.08 m: random ones, or those of a policy that explores, drag away what is laid.
-    * The state also says where the cloth belongs, and how its sides run. Corners and pickers do not tell where a cloth that
-      has been moved hung, how much of it is laid, or which way it bulges.
-
-    And:
-
-    * The cloth hangs at x = 0 (SoftGym: up to 0.1 m beside it), for its goal would be seen in no image after the start;
-      it hangs at an angle instead.
-    * What is said of the cloth and the pickers at `FoldCloth-v0`.
+    * The goal of the lower half is flat on the floor.
+    * Distances are horizontal. In space, releasing the cloth would score 0.7, since a heap on the floor is closer to the
+      goals than a cloth in the air.
+    * The weight of f is 7 instead of 1.2. With a smaller weight, laying out the lower half would score less than laying out
+      a quarter of the cloth (with 1.2: -0.37 and 0.43), and a learner would stop there.
+    * The pickers reach the floor, and they hold the cloth at the start. In SoftGym they are only near it.
+    * The lower edge starts at the floor. From higher up, the first steps toward the fold would score nothing, while
+      carrying the cloth forward in the air would score 0.33 and lead nowhere.
+    * Pickers move 0.03 m in one step instead of 0.08 m. Larger random moves would drag the cloth away during exploration.
+    * The state also contains the sides of the cloth relative to its goal. Corners and pickers alone do not show where a
+      moved cloth was at the start, how much of it lies on the floor, or to which side it bulges.
+    * The cloth hangs at x = 0 and at an angle. In SoftGym it hangs up to 0.1 m away; images after the start would not show
+      where its goal is.
+    * The differences of cloth and pickers listed for `FoldCloth-v0` apply.
 
     ## Version History
 

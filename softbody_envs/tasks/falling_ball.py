@@ -1,4 +1,4 @@
-"""FallingBall: a diagnostic in which the order of any two frames shows."""
+"""FallingBall: a diagnostic task in which the temporal order of any two frames is visible."""
 
 from typing import ClassVar
 
@@ -9,13 +9,13 @@ from softbody_envs.rendering import Camera
 from softbody_envs.sim.ball import RADIUS, Ball
 from softbody_envs.sim.world import World
 
-#: Control steps of an episode, and how far the ball sinks in each, m: more than a pixel of 64.
+#: Control steps of an episode, and distance that the ball sinks in each, m: more than a pixel of a 64-pixel image.
 HORIZON = 50
 SINK = 0.034
-#: Height of the centre at first, m, and of the lowest ball's centre at the end.
+#: Range of the initial height of the ball's centre, m, and lowest height at the end of an episode, m.
 STARTS = (1.83, 1.87)
 LOWEST = STARTS[0] - HORIZON * SINK
-#: How far an action moves the ball sideways, m, and how far from the middle it may be.
+#: Largest sideways move in one control step, m, and largest distance from the middle, m.
 DRIFT = 0.01
 SIDE = 0.6
 
@@ -24,14 +24,17 @@ class FallingBallEnv(SoftbodyEnv):
     """
     ## Description
 
-    A ball sinks at a constant speed, as in oil, through the whole episode. There is nothing to achieve: of any two frames
-    of an episode the one with the lower ball is the later one, so that a method that learns the order of frames must
-    succeed here.
+    A ball sinks at a constant speed during the whole episode, as in oil. There is nothing to achieve. Of any two frames of
+    an episode, the one with the lower ball is the later one: a method that learns the temporal order of frames must succeed
+    here.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`: moves the ball sideways by up to 1 cm in a step, which changes neither its fall nor the
-    reward.
+    `Box(-1, 1, (1,), float32)`:
+
+    | Num | Action | Largest change in one step |
+    |-----|--------|----------------------------|
+    | 0 | move the ball sideways, without effect on its fall or the reward | 0.01 m |
 
     ## Observation Space
 
@@ -44,14 +47,17 @@ class FallingBallEnv(SoftbodyEnv):
 
     ## Rewards
 
-    Each step: the fraction of its way that the ball has come, whatever the action.
+    Each step: the fraction of its path that the ball has covered, regardless of the action.
 
-    `performance` and `normalized_performance` are this reward; `is_success` from 0.9 on; `monotone` is how far the ball has
-    sunk, in m: it rises in every step.
+    | `info` key | Meaning |
+    |------------|---------|
+    | `performance`, `normalized_performance` | the reward |
+    | `is_success` | `normalized_performance` is at least 0.9 |
+    | `monotone` | distance that the ball has sunk, m; it rises in every step |
 
     ## Starting State
 
-    The ball near the upper edge of the image. A variation draws its height (1.83 to 1.87 m) and x (-0.5 to 0.5 m).
+    The ball is near the upper edge of the image. Variations differ in its height (1.83 to 1.87 m) and in x (-0.5 to 0.5 m).
 
     ## Episode End
 
@@ -94,9 +100,9 @@ class FallingBallEnv(SoftbodyEnv):
         return np.array([self._x, self._z])
 
     def performance(self) -> float:
-        """Fraction of the way down that is done."""
+        """Fraction of the path that the ball has covered."""
         return self.monotone() / (HORIZON * SINK)
 
     def monotone(self) -> float:
-        """How far the ball has sunk, m."""
+        """Distance that the ball has sunk, m."""
         return self._start - self._z

@@ -11,18 +11,18 @@ from softbody_envs.sim.pickers import REACH, Pickers
 from softbody_envs.sim.world import World
 from softbody_envs.tasks.picker_env import PickerEnv
 
-#: Radius of the pickers, m, and how far from their centres a node may be to be taken: radius, threshold and radius of a
-#: particle of SoftGym's.
+#: Radius of the pickers, m, and largest distance from their centres to a node that they can grasp, m (in SoftGym: radius
+#: of the picker, threshold, and radius of a particle).
 PICKER_RADIUS = 0.05
 GRASP_RANGE = PICKER_RADIUS + 0.005 + 0.00625
-#: kg: a cloth does not hold them back.
+#: Mass of a picker, kg: large enough that the cloth does not slow it down.
 PICKER_MASS = 100.0
-#: The pickers start at this height, m, and this far from the middle of the edge to carry.
+#: Initial height of the pickers, m, and their distance from the middle of the edge to carry, m.
 PICKER_HEIGHT = 0.10
 PICKER_OFFSET = 0.10
-#: Range of both sides of the cloth, m.
+#: Range of the side lengths of the cloth, m.
 SIZES = (0.38, 0.54)
-#: Control steps in which the cloth comes to rest before an episode.
+#: Control steps before an episode in which the cloth comes to rest.
 SETTLE_STEPS = 2
 #: Rows of nodes in each half of the cloth; the middle row belongs to neither.
 N_HALF = N_SIDE // 2
@@ -34,11 +34,12 @@ class FoldClothEnv(PickerEnv):
     """
     ## Description
 
-    A cloth lies flat on the floor. Two pickers start above one of its edges. Take that edge by its corners, carry it over
-    the cloth and lay it on the edge opposite, so that one half lies on the other and the other has not moved.
+    A cloth lies flat on the floor. Two pickers start above one of its edges. Grasp the corners of that edge, carry it over
+    the cloth and lay it on the opposite edge: one half should lie on the other, and the other half should not move.
 
-    The cloth is a mesh of 9 x 9 masses and springs in Bullet's deformable world. Its face is pink, its underside yellow.
-    A picker is a sphere, dark while it holds something; the farther its shadow is from it the higher it is.
+    The cloth is a mesh of 9 x 9 masses and springs in Bullet's deformable world. Its face is pink and its underside yellow.
+    The pickers are spheres. They are darker while they hold something. The distance of a picker from its shadow shows its
+    height.
 
     ## Action Space
 
@@ -47,13 +48,12 @@ class FoldClothEnv(PickerEnv):
     | Num | Action | Meaning |
     |-----|--------|---------|
     | 0, 1, 2 | move picker 0 along x, y, z | 0.08 m in one step |
-    | 3 | pick | above 0: hold, or take the nearest free node within 6.1 cm of the centre; otherwise: let go |
+    | 3 | pick | above 0: hold, or grasp the nearest free node within 6.1 cm of the centre; otherwise: release |
     | 4, 5, 6 | move picker 1 along x, y, z | 0.08 m in one step |
     | 7 | pick | as 3 |
 
     The centres of the pickers stay within x, y = -0.45 to 0.45 m and z = 0.05 to 0.4 m. Two pickers that hold the cloth
-    cannot be sent further apart than 1.1 times the distance of what they hold in the flat cloth. With `keep_hold=True` both
-    hold all the time, whatever elements 3 and 7 say.
+    cannot move farther apart than 1.1 times the distance of the held nodes in the flat cloth.
 
     ## Observation Space
 
@@ -62,50 +62,54 @@ class FoldClothEnv(PickerEnv):
     | Num | Observation | Unit |
     |-----|-------------|------|
     | 0 to 5 | x, y, z of the two corners of the edge to carry | m |
-    | 6 to 11 | x, y, z of the corners where those belong, in the same order | m |
+    | 6 to 11 | x, y, z of the opposite corners, where those belong, in the same order | m |
     | 12 to 17 | x, y, z of picker 0, then of picker 1 | m |
-    | 18, 19 | whether picker 0, picker 1 holds the cloth | 0 or 1 |
-    | 20 to 25 | x, y, z of the corner of the edge to carry that each picker starts nearer to, seen from that picker | 0.08 m |
-    | 26 to 31 | x, y, z of the corners where those belong, seen from them | 0.08 m |
+    | 18, 19 | whether picker 0 and picker 1 hold the cloth | 0 or 1 |
+    | 20 to 25 | x, y, z of the corner to carry that is closer to each picker at the start, relative to that picker | 0.08 m |
+    | 26 to 31 | x, y, z of the opposite corners relative to the corners to carry | 0.08 m |
 
-    Elements are clipped at their bounds: what is farther than 0.8 m, elements 20 to 31 do not tell.
+    Elements are clipped to the bounds, elements 20 to 31 therefore at 0.8 m.
 
     ## Rewards
 
-    Each step: -(d + 1.2 f). d is the mean distance between a node of the carried half and its mirror image in the other
-    half, f the mean distance of the other half's nodes from where they were at reset, both in m. The middle row of nodes
-    counts in neither.
+    Each step: -(d + 1.2 f), where d is the mean distance between a node of the carried half and its mirror image in the
+    other half, and f is the mean distance of the other half's nodes from their positions at reset, both in m. The middle
+    row of nodes belongs to neither half.
 
-    `performance` is this reward; `normalized_performance` = 1 - performance / initial performance; `is_success` from 0.9
-    on; `monotone` is -d.
+    | `info` key | Meaning |
+    |------------|---------|
+    | `performance` | the reward |
+    | `normalized_performance` | 1 - performance / initial |
+    | `is_success` | `normalized_performance` is at least 0.9 |
+    | `monotone` | -d, m |
 
     ## Starting State
 
-    The cloth flat, its middle at the origin, the pickers 10 cm above the floor, 10 cm to either side of the middle of the
-    edge to carry. A variation draws both sides of the cloth (0.38 to 0.54 m) and its orientation (up to 45 degrees either
-    way).
+    The cloth is flat and centred at the origin. The pickers are 10 cm above the floor, 10 cm to either side of the middle
+    of the edge to carry. Variations differ in both side lengths of the cloth (0.38 to 0.54 m) and in its orientation (-45
+    to 45 degrees).
 
     ## Episode End
 
-    Truncation after 100 steps (8 s). There is no termination. Should the simulation fail (an edge of more than 4 times
-    its length), the episode is truncated with `info["sim_error"]`, and the next one starts in a new world.
+    Truncation after 100 steps (8 s). There is no termination. If the simulation fails (an edge is longer than 4 times
+    its rest length), the episode is truncated with `info["sim_error"]`, and the next one starts in a new world.
 
     ## Arguments
 
     See `SoftbodyEnv`, and
 
-    * `keep_hold` (default `False`): the pickers take the cloth when they come near it and never let go; what is left to
-      decide is where they go. The cloth can be folded so.
+    * `keep_hold` (default `False`): pickers grasp the cloth when they reach it and never release it, regardless of actions
+      3 and 7. Only the motion of the pickers remains to be learned. The task can be solved without releasing.
 
     ## Differences from SoftGym
 
-    * 81 nodes instead of 3600 to 14161, and sides of 0.38 to 0.54 m instead of 0.37 to 0.74 m: the whole cloth is in
-      the image and within reach of the pickers, whose box is smaller and about the cloth's middle. The camera stands a
-      little further off.
-    * Layers do not collide with each other: they lie in each other, and a perfect fold scores 1 but for what moved.
-    * Pickers do not push the cloth, and they cannot tear it apart (SoftGym has a guard against that, switched off).
-    * The state also says which picker holds something, where its corner is from it, and how far the corner has to go, both
-      in units of what a picker moves in one step.
+    * The cloth has 81 nodes instead of 3600 to 14161, and sides of 0.38 to 0.54 m instead of 0.37 to 0.74 m. All of it is in
+      the image and within reach of the pickers, whose box is smaller and centred on the cloth. The camera is slightly
+      farther away.
+    * Layers of the cloth do not collide with each other, so that they interpenetrate.
+    * Pickers do not push the cloth and cannot tear it. SoftGym has a guard against tearing, which is switched off.
+    * The state also contains which pickers hold something, where the corners are relative to the pickers, and how far the
+      corners are from their goals, the latter two in units of a picker's largest move.
     * The cloth has no stripe of the other colour, and only the pickers cast shadows.
 
     ## Version History
@@ -130,11 +134,11 @@ class FoldClothEnv(PickerEnv):
 
     #: Lowest and highest corner of the box that the centres of the pickers stay in, m.
     workspace: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]] = ((-0.45, -0.45, PICKER_RADIUS), (0.45, 0.45, 0.40))
-    #: Farthest that a picker moves along each axis in one control step, m.
+    #: Largest move of a picker along each axis in one control step, m.
     picker_reach: ClassVar[float] = REACH
-    #: Weight of how far the lower half is from its place against how far apart the halves are.
+    #: Weight of the lower half's distance from its goal, relative to the distance between the halves.
     fixation_weight: ClassVar[float] = 1.2
-    #: How many of x, y, z these distances have.
+    #: Number of axes, of x, y, z, in which these distances are measured.
     measured_axes: ClassVar[int] = 3
 
     def _build(self, world: World, rng: np.random.Generator) -> None:
@@ -148,7 +152,7 @@ class FoldClothEnv(PickerEnv):
         self._place = self._kept()
 
     def _furnish(self, world: World, grid: np.ndarray, pickers: list[tuple[float, float, float]]) -> None:
-        """Put a floor, a cloth at rest and two pickers into the world."""
+        """Add a floor, a cloth at rest and two pickers to the world."""
         self._floor = world.add_box_floor()
         self.cloth = Cloth(world, grid)
         low, high = np.array(self.workspace)
@@ -160,11 +164,11 @@ class FoldClothEnv(PickerEnv):
         self._grid = self.cloth.grid()
 
     def _carried(self) -> np.ndarray:
-        """Nodes of the half to lay on the other, from its edge to the middle, m, ``(N_HALF, N_SIDE, 3)``."""
+        """Nodes of the half to carry, from its edge to the middle, m, ``(N_HALF, N_SIDE, 3)``."""
         return self._grid[:N_HALF]
 
     def _kept(self) -> np.ndarray:
-        """The nodes of the other half that they belong on, m, ``(N_HALF, N_SIDE, 3)``."""
+        """Mirror images of these nodes in the other half, m, ``(N_HALF, N_SIDE, 3)``."""
         return self._grid[: -N_HALF - 1 : -1]
 
     def _measure(self) -> np.ndarray:
@@ -175,7 +179,7 @@ class FoldClothEnv(PickerEnv):
         return np.concatenate([corners.ravel(), pickers.ravel(), holds, ways.ravel()])
 
     def performance(self) -> float:
-        """Minus the mean distance between the halves, and minus that of the lower half from its place, weighted, m."""
+        """Minus the mean distance between the halves and the weighted mean distance of the lower half from its goal, m."""
         axes = self.measured_axes
         apart = _mean_distance(self._carried()[..., :axes], self._kept()[..., :axes])
         moved = _mean_distance(self._kept()[..., :axes], self._place[..., :axes])
@@ -186,7 +190,7 @@ class FoldClothEnv(PickerEnv):
         return -_mean_distance(self._carried(), self._kept())
 
     def fault(self) -> str | None:
-        """An explosion of the cloth."""
+        """Describe how the cloth has exploded, or return ``None``."""
         return self.cloth.fault()
 
     def _image(self, size: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What the tasks with two pickers share."""
+"""Base class of the tasks with two pickers."""
 
 from abc import abstractmethod
 from typing import Any, ClassVar
@@ -9,15 +9,15 @@ from gymnasium.utils import EzPickle
 from softbody_envs.env import SoftbodyEnv
 from softbody_envs.sim.pickers import Pickers
 
-#: Elements of an action that say whether a picker holds.
+#: Indices of the actions that make a picker hold.
 PICKS = [3, 7]
 
 
 class PickerEnv(SoftbodyEnv):
     """
-    Base class of the tasks with two pickers, which a task makes in its ``_build``.
+    Base class of the tasks with two pickers, which a task creates in ``_build``.
 
-    :param keep_hold: the pickers take what they come near to and never let go, whatever the action says
+    :param keep_hold: whether pickers grasp whatever they reach and never let go, regardless of the action
     """
 
     action_size: ClassVar[int] = 8
@@ -37,4 +37,4 @@ class PickerEnv(SoftbodyEnv):
 
     @abstractmethod
     def _locate(self) -> None:
-        """Find out where rope or cloth is; between control steps nothing moves."""
+        """Read the positions of the rope or the cloth once per control step."""

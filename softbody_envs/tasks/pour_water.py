@@ -1,4 +1,4 @@
-"""PourWater: tilt a cup until its water is in another cup."""
+"""PourWater: pour the water of one cup into another."""
 
 from typing import ClassVar
 
@@ -12,11 +12,11 @@ from softbody_envs.sim.world import World
 
 #: Largest change of the pose in one control step: x (m), z (m), tilt (rad).
 REACH = np.array([0.08, 0.08, 0.12])
-#: The cup may come this close to the target, m: no particle fits between them and is squeezed through a wall.
+#: Smallest distance between cup and target, m: a particle between them is not squeezed through a wall.
 MARGIN = DIAMETER
-#: The sink that catches spilled water lies this far under the cups, so that no cup can press a particle into it, m.
+#: Depth of the sink for spilled water below the cups, m: no cup can press a particle into the floor.
 SINK_DEPTH = 0.10
-#: Control steps in which the water comes to rest before an episode.
+#: Control steps before an episode in which the water comes to rest.
 SETTLE_STEPS = 8
 
 
@@ -24,13 +24,15 @@ class PourWaterEnv(SoftbodyEnv):
     """
     ## Description
 
-    A cup of water stands beside a higher one. Lift the first, bring its spout over the other, and tilt it until all the
-    water is in the target. The water is 40 to 80 frictionless spheres of 2 cm radius; both cups are drawn without their
-    front wall, which is there.
+    A cup of water stands beside a higher cup, the target. Lift the cup, bring its rim over the target, and tilt it until
+    all the water is in the target.
+
+    The water consists of 40 to 80 frictionless spheres of 2 cm radius. The front walls of both cups exist but are not
+    drawn.
 
     ## Action Space
 
-    `Box(-1, 1, (3,), float32)`, a velocity held for one control step of 0.08 s:
+    `Box(-1, 1, (3,), float32)`: a velocity, constant during a control step of 0.08 s.
 
     | Num | Action | Largest change in one step |
     |-----|--------|----------------------------|
@@ -38,10 +40,10 @@ class PourWaterEnv(SoftbodyEnv):
     | 1 | move up | 0.08 m |
     | 2 | tilt toward the target | 0.12 rad |
 
-    The step is made of ten equal moves. A move is refused as a whole if a corner of the cup would sink below the height
-    at which it started, or if the cup would come nearer to the target than one particle's diameter (4 cm). On the table,
-    then, the cup cannot be tilted. Pose limits: x from -0.3 m to 0.3 m beyond the target, height 0 to 0.75 m, tilt
-    -pi to pi.
+    A control step consists of ten equal moves. A move is not executed at all if a corner of the cup would sink below its
+    initial height, or if the cup would come closer to the target than one particle diameter (4 cm). Therefore the cup must
+    be lifted before it can be tilted. The pose is limited to x from -0.3 m to 0.3 m beyond the target, height from 0 to
+    0.75 m, and tilt from -pi to pi.
 
     ## Observation Space
 
@@ -49,27 +51,31 @@ class PourWaterEnv(SoftbodyEnv):
 
     | Num | Observation | Unit |
     |-----|-------------|------|
-    | 0, 1 | position of the cup's underside: x, height | m |
+    | 0, 1 | x and height of the middle of the cup's underside | m |
     | 2 | tilt of the cup, positive toward the target | rad |
     | 3, 4, 5 | inner length (x), inner width (y) and height of the cup | m |
     | 6 | x of the target | m |
     | 7, 8, 9 | height, inner length (x) and inner width (y) of the target | m |
     | 10 | height of the highest particle | m |
-    | 11 | fraction of the water that is in the target | 1 |
-    | 12 | fraction of the water that is in the cup | 1 |
+    | 11 | fraction of the water in the target | 1 |
+    | 12 | fraction of the water in the cup | 1 |
 
     ## Rewards
 
-    Each step: the number of particles that are in the target and not in the cup, divided by the number of particles.
+    Each step: the fraction of the particles that are in the target and not in the cup.
 
-    `performance` is this reward; `normalized_performance` = (performance - initial) / (1 - initial); `is_success` from
-    0.9 on; `monotone` is the fraction of the water in the target.
+    | `info` key | Meaning |
+    |------------|---------|
+    | `performance` | the reward |
+    | `normalized_performance` | (performance - initial) / (1 - initial) |
+    | `is_success` | `normalized_performance` is at least 0.9 |
+    | `monotone` | fraction of the water in the target |
 
     ## Starting State
 
-    The water at rest in the upright cup at x = 0. A variation draws the cup's floor (4 to 6 by 3 to 4 particles), the
-    number of particles (40 to 80), the cup's height (1.15 to 1.6 times the water's, and 2 cm), how much longer, wider and
-    higher the target is (up to 4, 4 and 10 cm), and the gap between the cups (8 to 22 cm).
+    The water rests in the upright cup at x = 0. Variations differ in the cup's floor (4 to 6 by 3 to 4 particles), the
+    number of particles (40 to 80), the height of the cup (1.15 to 1.6 times that of the water, plus 2 cm), the additional
+    length, width and height of the target (up to 4, 4 and 10 cm), and the gap between the cups (8 to 22 cm).
 
     ## Episode End
 
@@ -81,13 +87,14 @@ class PourWaterEnv(SoftbodyEnv):
 
     ## Differences from SoftGym
 
-    * Spheres of 2 cm instead of some thousand FleX particles: coarse water, which leaves a tilted cup in surges.
-    * The cup keeps one particle's diameter from the target, and spilled water falls into a sink 10 cm lower: nothing can
-      be pressed through a wall. SoftGym refuses only the touch itself, and leaves the water on the table.
-    * A pose has limits, so that the cup stays in the image.
-    * Element 6 of the state is the target's place; SoftGym adds the cup's to it.
-    * Whether water is in a tilted cup is asked in the cup's frame; SoftGym takes an upright box.
-    * Cups never overlap at the start (in SoftGym in 0.7 % of the variations).
+    * The water consists of 40 to 80 spheres instead of some thousand FleX particles. It is coarse and leaves a tilted cup
+      in surges.
+    * The cup keeps one particle diameter from the target, and spilled water falls into a sink 10 cm below: no particle is
+      pressed through a wall. In SoftGym only contact is prevented, and spilled water stays on the table.
+    * The pose is limited, so that the cup stays in the image.
+    * Element 6 of the state is the position of the target. In SoftGym the position of the cup is added to it.
+    * Water in a tilted cup is counted in the frame of the cup. SoftGym uses an upright box.
+    * The cups never overlap at the start. In SoftGym they do in 0.7 % of the variations.
 
     ## Version History
 
@@ -157,7 +164,7 @@ class PourWaterEnv(SoftbodyEnv):
         pose = np.array([self.cup.x, self.cup.z, self.cup.angle])
         part = np.arange(1, self.steps_per_control + 1)[:, None] / self.steps_per_control
         way = np.clip(pose + part * action * REACH, self._low, self._high)
-        # A move that is refused is refused again in every step that remains.
+        # Once a move is refused, all later moves of the step are.
         for there, allowed in zip(way, np.logical_and.accumulate(self._allowed(way)), strict=True):
             pose = there if allowed else pose
             self.cup.move(*pose)
@@ -166,16 +173,17 @@ class PourWaterEnv(SoftbodyEnv):
 
     def _allowed(self, poses: np.ndarray) -> np.ndarray:
         """
-        SoftGym refuses a move as a whole if a corner would sink below the table or the cup would touch the target.
+        Test which poses keep the cup above the table and away from the target. As in SoftGym, a move to any other pose is
+        refused entirely.
 
-        :param poses: x and z of the underside's middle, m, and tilt, rad, ``(..., 3)``
+        :param poses: x and z of the middle of the underside, m, and tilt, rad, ``(..., 3)``
         :return: bool ``(...)``
         """
         outlines = corners(self.cup.size, *np.moveaxis(poses, -1, 0))
         return (outlines[..., 1].min(axis=-1) >= -1e-9) & ~overlap(outlines, self._forbidden)
 
     def _locate(self) -> None:
-        """Find out where each particle is; between control steps nothing moves."""
+        """Count the particles in each cup, once per control step."""
         positions = self.water.positions()
         in_cup = self.cup.contains(positions)
         self._highest = positions[:, 2].max()
@@ -204,9 +212,9 @@ class PourWaterEnv(SoftbodyEnv):
         )
 
     def performance(self) -> float:
-        """Fraction of the particles that are in the target and not in the cup."""
+        """Fraction of the water in the target and not in the cup."""
         return self.n_in_target / len(self.water)
 
     def monotone(self) -> float:
-        """Water level of the target, as the fraction of the water that is in it."""
+        """Fraction of the water in the target."""
         return self.n_in_target / len(self.water)

@@ -1,4 +1,4 @@
-"""PourWaterAmount: fill another cup to a line."""
+"""PourWaterAmount: pour water into a cup up to a line."""
 
 from typing import ClassVar
 
@@ -10,9 +10,9 @@ from softbody_envs.sim.water import VOLUME
 from softbody_envs.sim.world import World
 from softbody_envs.tasks.pour_water import PourWaterEnv
 
-#: Share of a filled volume that the spheres themselves take up: poured, frictionless, near walls.
+#: Fraction of a filled volume that the spheres occupy after they were poured.
 PACKING = 0.55
-#: Of the line, m: at least a pixel of a 64-pixel image.
+#: Thickness of the line, m: at least a pixel of a 64-pixel image.
 BAR_WIDTH = 0.028
 
 
@@ -20,11 +20,12 @@ class PourWaterAmountEnv(PourWaterEnv):
     """
     ## Description
 
-    As PourWater, but only up to the red line on the target's back wall. What has been poured cannot be taken back.
+    Pour water from a cup into the target, as in `PourWater-v0`, but only up to the red line on the back wall of the
+    target. Poured water cannot be taken back.
 
     ## Action Space
 
-    That of PourWater: `Box(-1, 1, (3,), float32)`.
+    `Box(-1, 1, (3,), float32)`, as in `PourWater-v0`:
 
     | Num | Action | Largest change in one step |
     |-----|--------|----------------------------|
@@ -34,26 +35,29 @@ class PourWaterAmountEnv(PourWaterEnv):
 
     ## Observation Space
 
-    `obs_type="pixels"`: an RGB image. `obs_type="state"`: `Box(-10, 10, (15,), float32)`, the 13 elements of PourWater and
+    `obs_type="pixels"`: an RGB image. `obs_type="state"`: `Box(-10, 10, (15,), float32)`: the 13 elements of
+    `PourWater-v0` and
 
     | Num | Observation | Unit |
     |-----|-------------|------|
     | 13 | height of the line | m |
-    | 14 | wanted fraction of the water | 1 |
+    | 14 | goal: fraction of the water to pour | 1 |
 
     ## Rewards
 
-    Each step: minus the distance between the wanted number of particles and the number in the target, divided by the
-    number of all particles; from -1 to 0.
+    Each step: minus the difference between the fraction of the water in the target and the goal; from -1 to 0.
 
-    `performance` is this reward; `normalized_performance` = (performance - initial) / (0 - initial), so that the wanted
-    amount scores 1, an untouched scene 0, and twice the wanted amount 0; `is_success` from 0.9 on; `monotone` is the
-    fraction of the water in the target.
+    | `info` key | Meaning |
+    |------------|---------|
+    | `performance` | the reward |
+    | `normalized_performance` | 1 - performance / initial: 1 at the goal, 0 for no water and for twice the goal |
+    | `is_success` | `normalized_performance` is at least 0.9 |
+    | `monotone` | fraction of the water in the target |
 
     ## Starting State
 
-    That of PourWater. Each variation draws the wanted fraction from U(0.2, 1), rounded down to whole particles; the line
-    is where so many spheres, loosely packed, fill the target.
+    As in `PourWater-v0`. The goal is drawn from U(0.2, 1) for each variation and rounded down to whole particles. The line
+    is at the height to which that number of loosely packed spheres fills the target.
 
     ## Episode End
 
@@ -65,13 +69,13 @@ class PourWaterAmountEnv(PourWaterEnv):
 
     ## Differences from SoftGym
 
-    Those of PourWater, and:
+    Those of `PourWater-v0`, and:
 
-    * SoftGym normalizes as if the best performance were 1, though it is 0: its score ends at t / (1 + t) for the fraction
-      t. Here it ends at 1.
-    * SoftGym draws one fraction for all its variations. Here each has its own.
-    * The state keeps the fractions of water in target and cup.
-    * The line is on the back wall, where the camera sees it from the start; SoftGym's is on the left.
+    * A perfect solution has `normalized_performance` 1. SoftGym normalizes as if the best performance were 1 instead of 0,
+      so that its highest score is t / (1 + t) for the goal t.
+    * Each variation has its own goal. SoftGym draws one for all variations.
+    * The state contains the fractions of the water in target and cup.
+    * The line is on the back wall, where the camera sees it from the start. In SoftGym it is on the left wall.
 
     ## Version History
 
@@ -100,5 +104,5 @@ class PourWaterAmountEnv(PourWaterEnv):
         return np.append(super()._measure(), [self.line, self.n_wanted / len(self.water)])
 
     def performance(self) -> float:
-        """Minus the distance from the wanted number of particles, as a fraction of all."""
+        """Minus the difference between the fraction of the water in the target and the goal."""
         return -abs(self.n_wanted - self.n_in_target) / len(self.water)

@@ -16,10 +16,10 @@ PICKER_RADIUS = 0.02
 #: SoftGym: picker radius 0.02 + particle radius 0.025 + threshold 0.005.
 GRASP_RANGE = 0.05
 PICKER_STARTS = np.array([(0.0, 0.04, 0.10), (0.0, -0.04, 0.10)])
-#: The box that the pickers' centres stay in, m.
+#: Corners of the box that the centres of the pickers stay in, m.
 LOW = np.array([-0.28, -0.28, 0.02])
 HIGH = np.array([0.28, 0.28, 0.20])
-#: The nodes that the state tells of: SoftGym's 0, 4, ..., 32, 40 of 41 particles.
+#: Nodes in the state vector. In SoftGym: 0, 4, ..., 32 and 40 of 41 particles.
 KEY_NODES = (0, 2, 4, 6, 8, 10, 12, 14, 16, 20)
 
 
@@ -27,11 +27,11 @@ class StraightenRopeEnv(PickerEnv):
     """
     ## Description
 
-    A crumpled rope lies on the floor, seen from straight above. Two pickers hover over it. Straighten it: bring its ends as
-    far apart as the rope is long.
+    A crumpled rope lies on the floor, seen from directly above. Two pickers hover over it. Straighten the rope: pull its
+    ends apart until their distance is its length.
 
-    The rope is 0.5 m long: 20 rigid segments in a chain, in Bullet's rigid world. It is blue with yellow ends. A picker is a
-    sphere, red or green, dark while it holds something; the farther its shadow is from it the higher it is.
+    The rope is a chain of 20 rigid segments, 0.5 m long, blue with yellow ends. The pickers are a red and a green sphere.
+    They are darker while they hold something. The distance of a picker from its shadow shows its height.
 
     ## Action Space
 
@@ -40,14 +40,14 @@ class StraightenRopeEnv(PickerEnv):
     | Num | Action | Meaning |
     |-----|--------|---------|
     | 0, 1, 2 | move the red picker along x, y, z | 0.08 m in one step |
-    | 3 | pick | above 0: hold, or take the nearest free node within 5 cm of the centre; otherwise: let go |
+    | 3 | pick | above 0: hold, or grasp the nearest free node within 5 cm of the centre; otherwise: release |
     | 4, 5, 6 | move the green picker along x, y, z | 0.08 m in one step |
     | 7 | pick | as 3 |
 
     x points right in the image, y up, z toward the camera. The centres of the pickers stay within x, y = -0.28 to 0.28 m and
-    z = 0.02 to 0.20 m. A picker keeps the offset at which it took a node. It pulls with 2.5 N at most (the rope weighs 1 N):
-    when the rope cannot follow it stays behind. Two pickers that hold the rope cannot be sent farther apart than the rope
-    between them is long. With `keep_hold=True` both hold all the time, whatever elements 3 and 7 say.
+    z = 0.02 to 0.20 m. A picker keeps the offset at which it grasped a node. Its force is limited to 2.5 N (the rope weighs
+    1 N): it lags behind if the rope cannot follow. Two pickers that hold the rope cannot move farther apart than the length
+    of the rope between them.
 
     ## Observation Space
 
@@ -57,47 +57,51 @@ class StraightenRopeEnv(PickerEnv):
     |-----|-------------|------|
     | 0 to 29 | x, y, z of the nodes 0, 2, 4, 6, 8, 10, 12, 14, 16 and 20 of 0..20; 0 and 20 are the ends | m |
     | 30 to 35 | x, y, z of the red picker, then of the green one | m |
-    | 36, 37 | whether the red, the green picker holds the rope | 0 or 1 |
-    | 38 to 49 | x, y, z of node 0 and of node 20, seen from the red picker, then from the green one | 0.08 m |
+    | 36, 37 | whether the red and the green picker hold the rope | 0 or 1 |
+    | 38 to 49 | x, y, z of node 0 and of node 20 relative to the red picker, then to the green one | 0.08 m |
 
     ## Rewards
 
-    Each step: -|d - 0.5|, d being the distance between the ends in m.
+    Each step: -|d - 0.5|, where d is the distance between the ends in m.
 
-    `performance` is this reward; `normalized_performance` = 1 - performance / initial performance; `is_success` from 0.9
-    on; `monotone` is d.
+    | `info` key | Meaning |
+    |------------|---------|
+    | `performance` | the reward |
+    | `normalized_performance` | 1 - performance / initial |
+    | `is_success` | `normalized_performance` is at least 0.9 |
+    | `monotone` | d, m |
 
     ## Starting State
 
-    A rope at rest, made as in SoftGym: four times, some node of a straight rope is pulled for 0.64 s in a random
-    direction and dropped. Each variation has a rope of its own, turned by a random angle and centred. The ends are at most
-    0.35 m apart and nothing lies on them. The pickers are 10 cm above the floor, 4 cm to either side of the middle.
+    The rope is at rest. It was crumpled as in SoftGym: four times, a random node of a straight rope was pulled for 0.64 s
+    in a random direction and dropped. Each variation has its own rope, rotated by a random angle and centred. The ends are
+    at most 0.35 m apart, and nothing lies on them. The pickers are 10 cm above the floor, 4 cm to either side of the middle.
 
     ## Episode End
 
-    Truncation after 75 steps (6 s). There is no termination. Should the simulation fail (a rope that is a fifth longer or
-    shorter than it was), the episode is truncated with `info["sim_error"]`, and the next one starts in a new world.
+    Truncation after 75 steps (6 s). There is no termination. If the simulation fails (the length of the rope changes
+    by more than a fifth), the episode is truncated with `info["sim_error"]`, and the next one starts in a new world.
 
     ## Arguments
 
     See `SoftbodyEnv`, and
 
-    * `keep_hold` (default `False`): a picker takes the rope when it comes near it and never lets go; what is left to decide
-      is where the pickers go.
+    * `keep_hold` (default `False`): pickers grasp the rope when they reach it and never release it, regardless of actions 3
+      and 7. Only the motion of the pickers remains to be learned.
 
     ## Differences from SoftGym
 
-    * `normalized_performance` is relative to the start, so that doing nothing scores 0. SoftGym divides by the length: an
-      untouched rope scores well above 0 there.
-    * The rope keeps its length within 5 %, whatever the pickers do. SoftGym's has 7.5 % of slack and can be stretched.
-    * 21 nodes instead of 41 particles; the state has the same ten of them, and says which picker holds something and
-      where the ends are from each picker, in units of what it moves in one step: with positions alone a learner remembers
-      ropes instead of reaching for ends.
-    * A start with its ends farther apart than 0.35 m, or under the rest of the rope, is drawn again: little would be left
-      to do, or the image would not show what to do.
-    * The ends are marked: in a heap of rope they look like bends.
-    * Pickers do not push the rope. Their box is smaller (0.33 m and 0.28 m in SoftGym) and the camera higher (0.85 m
-      there): the pickers never leave the image. Only they cast shadows, on the floor; in SoftGym all things do.
+    * `normalized_performance` is relative to the start: doing nothing scores 0. SoftGym divides by the length of the rope,
+      so that an untouched rope scores well above 0.
+    * The rope keeps its length within 5 %, whatever the pickers do. SoftGym's rope has 7.5 % of slack and can be stretched.
+    * The rope has 21 nodes instead of 41 particles. The state contains the same ten of them and, in addition, which pickers
+      hold something and where the ends are relative to the pickers, in units of a picker's largest move. With positions
+      alone, a learner memorizes ropes instead of reaching for their ends.
+    * Starts whose ends are farther apart than 0.35 m or lie under the rope are excluded: there would be little to do, or
+      the image would not show what to do.
+    * The ends are marked. Otherwise they look like bends in a heap of rope.
+    * Pickers do not push the rope. Their box is smaller (SoftGym: 0.33 m and 0.28 m) and the camera is higher (SoftGym:
+      0.85 m), so that the pickers never leave the image. Only they cast shadows, on the floor; in SoftGym all objects do.
 
     ## Version History
 
@@ -142,7 +146,7 @@ class StraightenRopeEnv(PickerEnv):
         return frame
 
     def performance(self) -> float:
-        """How far the distance between the ends is from the rope's length, m, negative."""
+        """Minus the difference between the distance of the ends and the length of the rope, m."""
         return -abs(self.monotone() - LENGTH)
 
     def monotone(self) -> float:

@@ -1,4 +1,4 @@
-"""SwingingBall: a diagnostic in which the order of two frames cannot be told."""
+"""SwingingBall: a diagnostic task in which the temporal order of two frames is not visible."""
 
 from typing import ClassVar
 
@@ -9,13 +9,13 @@ from softbody_envs.rendering import Camera
 from softbody_envs.sim.ball import Ball
 from softbody_envs.sim.world import World
 
-#: Control steps of one swing to and fro: an episode of 100 has a whole number of them.
+#: Control steps of one period. An episode of 100 steps has a whole number of periods.
 PERIOD = 20
-#: Where the pendulum hangs, m, its length, m, and its largest angle, rad.
+#: Pivot of the pendulum, m, its length, m, and its amplitude, rad.
 PIVOT = (0.0, 0.0, 1.75)
 LENGTH = 1.3
 AMPLITUDE = 0.5
-#: An episode starts with the ball at most this fraction of the way to the right.
+#: Largest initial displacement to the right, as a fraction of the amplitude.
 HIGHEST_START = 0.8
 
 
@@ -23,12 +23,16 @@ class SwingingBallEnv(SoftbodyEnv):
     """
     ## Description
 
-    A pendulum swings without friction. Played backward it looks the same: nothing tells which of two frames came first, so
-    that a method that claims to know the order of frames here has been misled. Its angle is a sine of time.
+    A pendulum swings without friction: its angle is a sine of time. Played backward, an episode looks the same, so nothing
+    shows which of two frames came first. A method that finds a temporal order here has been misled.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`: without effect.
+    `Box(-1, 1, (1,), float32)`:
+
+    | Num | Action | Largest change in one step |
+    |-----|--------|----------------------------|
+    | 0 | none: the action has no effect | 0 |
 
     ## Observation Space
 
@@ -41,14 +45,18 @@ class SwingingBallEnv(SoftbodyEnv):
 
     ## Rewards
 
-    Each step: how far to the right the ball is, from 0 (at its left end) to 1 (at its right end), whatever the action.
+    Each step: the position of the ball from 0 (left end) to 1 (right end), regardless of the action.
 
-    `performance` is this reward; `normalized_performance` = (performance - initial performance) / (1 - initial performance);
-    `is_success` from 0.9 on; `monotone` is x in m: in an episode it rises as often as it falls.
+    | `info` key | Meaning |
+    |------------|---------|
+    | `performance` | the reward |
+    | `normalized_performance` | (performance - initial) / (1 - initial) |
+    | `is_success` | `normalized_performance` is at least 0.9 |
+    | `monotone` | x of the ball, m; in an episode it rises as often as it falls |
 
     ## Starting State
 
-    A variation draws where the swing begins, to the left or to the right, but not at the right end.
+    Variations differ in the initial phase of the swing: any but those near the right end.
 
     ## Episode End
 
@@ -79,7 +87,7 @@ class SwingingBallEnv(SoftbodyEnv):
         world.add_floor()
         self._ball = Ball(world)
         limit = np.arcsin(HIGHEST_START)
-        self._start = rng.uniform(np.pi - limit, 2 * np.pi + limit)  # all phases but those around the right end
+        self._start = rng.uniform(np.pi - limit, 2 * np.pi + limit)  # all phases except those near the right end
         self._steps = 0
         self._place()
 
@@ -88,7 +96,7 @@ class SwingingBallEnv(SoftbodyEnv):
         self._place()
 
     def _place(self) -> None:
-        """Put the ball where it is at this time."""
+        """Move the ball to its position at the present time."""
         self._swing = np.sin(self._start + 2 * np.pi * self._steps / PERIOD)
         angle = AMPLITUDE * self._swing
         self._position = np.array(PIVOT) + LENGTH * np.array([np.sin(angle), 0.0, -np.cos(angle)])
@@ -98,7 +106,7 @@ class SwingingBallEnv(SoftbodyEnv):
         return self._position[[0, 2]]
 
     def performance(self) -> float:
-        """How far to the right the ball is, from 0 to 1."""
+        """Position of the ball from 0 (left end) to 1 (right end)."""
         return (1 + self._swing) / 2
 
     def monotone(self) -> float:

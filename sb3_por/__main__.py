@@ -51,18 +51,14 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """The model that the arguments name and the environment that it was trained in."""
     import softbody_envs  # noqa: F401  (registers its ids)
-    from sb3_por.evaluation.loading import find_environment, load_model, settings_of, trained_in
+    from sb3_por.evaluation.loading import find_environment, resolve
     from sb3_por.evaluation.reference_policies import REFERENCES
 
     if args.seed < 0:
         raise UserError(f"--seed must not be negative, got {args.seed}")
-    args.env = find_environment(args.env, None if args.model in REFERENCES else args.model)
-    if args.model in REFERENCES:
-        return REFERENCES[args.model](args.env), {}
-    model = load_model(args.model, args.algo)
-    if not (settings := settings_of(args.model, args.env)).is_file():
-        print(f"note: there is no {settings}: {args.env} is made without the training's wrappers", file=sys.stderr)
-    return model, trained_in(args.model, args.env)
+    is_reference = args.model in REFERENCES
+    args.env = find_environment(args.env, None if is_reference else args.model)
+    return (REFERENCES[args.model](args.env), {}) if is_reference else resolve(args.model, args.env, algo=args.algo)
 
 
 def _evaluate(args: argparse.Namespace) -> None:

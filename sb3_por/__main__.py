@@ -90,14 +90,13 @@ def _enjoy(args: argparse.Namespace) -> None:
 
 
 def _plot_arguments(parser: argparse.ArgumentParser) -> None:
-    from sb3_por.analysis.figures import KINDS, ORDER
-    from sb3_por.analysis.scores import METRICS
+    from sb3_por.analysis.names import FIGURES, METRICS, ORDER
 
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
     output = "the figure: .png, .pdf or .svg; .csv: its numbers; with --kind all a folder for every figure in all formats"
     parser.add_argument("-o", "--output", required=True, help=output)
     kinds = f"which figure (default iqm); {ORDER}: loss and accuracy of POR's classifier, from the runs' TensorBoard files"
-    parser.add_argument("--kind", choices=[*KINDS, ORDER, "all"], default="iqm", help=kinds)
+    parser.add_argument("--kind", choices=[*FIGURES, ORDER, "all"], default="iqm", help=kinds)
     parser.add_argument("--metric", choices=METRICS, default=METRICS[0], help=f"what to plot (default {METRICS[0]})")
     step = "compare at this step, and leave out runs that end before (default: the end of the shortest run)"
     parser.add_argument("--step", type=int, help=step)
@@ -216,7 +215,7 @@ def _suite(args: argparse.Namespace) -> int:
 
 
 def _report_arguments(parser: argparse.ArgumentParser) -> None:
-    from sb3_por.analysis.scores import METRICS
+    from sb3_por.analysis.names import METRICS
 
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
     parser.add_argument("-o", "--output", required=True, help="folder that gets index.html, and figures/ for print")

@@ -40,9 +40,9 @@ def evaluate(
     """
     if n_episodes < 1:
         raise UserError(f"an evaluation needs at least 1 episode, got {n_episodes}")
-    model, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
-    env = make_evaluation_env(model, env_id, **environment)
+    loaded, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
+    env = make_evaluation_env(loaded, env_id, **environment)
     try:
-        return run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))
+        return run_episodes(loaded, env, evaluation_episodes(env_id, n_episodes, seed))
     finally:
         env.close()

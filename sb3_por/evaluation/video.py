@@ -62,7 +62,7 @@ def record_video(
         raise UserError(f"a video needs at least 1 episode, got {n_episodes}")
     if size < 1:
         raise UserError(f"a video needs at least 1 pixel, got the size {size}")
-    model, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
+    loaded, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
     rendering: dict[str, Any] = {"render_mode": "rgb_array"} | ({} if task_class(env_id) is None else {"render_size": size})
     wrap = environment["env_wrapper"]
 
@@ -71,10 +71,10 @@ def record_video(
         return innermost if wrap is None else wrap(innermost)
 
     changes = {"env_kwargs": environment["env_kwargs"] | rendering, "env_wrapper": recorded}
-    env = make_evaluation_env(model, env_id, **environment | changes)
+    env = make_evaluation_env(loaded, env_id, **environment | changes)
     try:
         fps = env.get_attr("metadata")[0].get("render_fps", 30)
-        evaluation = run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))
+        evaluation = run_episodes(loaded, env, evaluation_episodes(env_id, n_episodes, seed))
         # The vectorised environment resets itself after the last episode: the last frame belongs to the next one.
         frames = env.env_method("render")[0][:-1]
     except gym.error.Error as error:

@@ -62,6 +62,10 @@ def _represent_class(dumper: yaml.SafeDumper, value: type) -> yaml.Node:
     return dumper.represent_scalar(f"{_NAME}{value.__module__}.{value.__qualname__}", "")
 
 
+def _construct_tuple(loader: yaml.SafeLoader, node: Any) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
 def _construct_class(loader: yaml.SafeLoader, name: str, _: yaml.Node) -> Any:
     try:
         return resolve_name(name)
@@ -74,7 +78,7 @@ _Dumper.add_multi_representer(object, lambda dumper, value: dumper.represent_str
 _Dumper.add_multi_representer(dict, lambda dumper, value: dumper.represent_dict(value))
 _Dumper.add_representer(tuple, lambda dumper, value: dumper.represent_sequence(_TUPLE, value))
 _Dumper.add_multi_representer(type, _represent_class)
-_Loader.add_constructor(_TUPLE, lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
+_Loader.add_constructor(_TUPLE, _construct_tuple)
 _Loader.add_multi_constructor(_NAME, _construct_class)
 
 

@@ -51,18 +51,14 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """The model that the arguments name and the environment that it was trained in."""
     import softbody_envs  # noqa: F401  (registers its ids)
-    from sb3_por.evaluation.loading import find_environment, load_model, settings_of, trained_in
+    from sb3_por.evaluation.loading import find_environment, resolve
     from sb3_por.evaluation.reference_policies import REFERENCES
 
     if args.seed < 0:
         raise UserError(f"--seed must not be negative, got {args.seed}")
-    args.env = find_environment(args.env, None if args.model in REFERENCES else args.model)
-    if args.model in REFERENCES:
-        return REFERENCES[args.model](args.env), {}
-    model = load_model(args.model, args.algo)
-    if not (settings := settings_of(args.model, args.env)).is_file():
-        print(f"note: there is no {settings}: {args.env} is made without the training's wrappers", file=sys.stderr)
-    return model, trained_in(args.model, args.env)
+    is_reference = args.model in REFERENCES
+    args.env = find_environment(args.env, None if is_reference else args.model)
+    return (REFERENCES[args.model](args.env), {}) if is_reference else resolve(args.model, args.env, algo=args.algo)
 
 
 def _evaluate(args: argparse.Namespace) -> None:
@@ -94,14 +90,13 @@ def _enjoy(args: argparse.Namespace) -> None:
 
 
 def _plot_arguments(parser: argparse.ArgumentParser) -> None:
-    from sb3_por.analysis.figures import KINDS, ORDER
-    from sb3_por.analysis.scores import METRICS
+    from sb3_por.analysis.names import FIGURES, METRICS, ORDER
 
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
     output = "the figure: .png, .pdf or .svg; .csv: its numbers; with --kind all a folder for every figure in all formats"
     parser.add_argument("-o", "--output", required=True, help=output)
     kinds = f"which figure (default iqm); {ORDER}: loss and accuracy of POR's classifier, from the runs' TensorBoard files"
-    parser.add_argument("--kind", choices=[*KINDS, ORDER, "all"], default="iqm", help=kinds)
+    parser.add_argument("--kind", choices=[*FIGURES, ORDER, "all"], default="iqm", help=kinds)
     parser.add_argument("--metric", choices=METRICS, default=METRICS[0], help=f"what to plot (default {METRICS[0]})")
     step = "compare at this step, and leave out runs that end before (default: the end of the shortest run)"
     parser.add_argument("--step", type=int, help=step)
@@ -220,7 +215,7 @@ def _suite(args: argparse.Namespace) -> int:
 
 
 def _report_arguments(parser: argparse.ArgumentParser) -> None:
-    from sb3_por.analysis.scores import METRICS
+    from sb3_por.analysis.names import METRICS
 
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_FOLDER", help="runs, folders of runs, or tables of scores (.csv)")
     parser.add_argument("-o", "--output", required=True, help="folder that gets index.html, and figures/ for print")

@@ -16,9 +16,10 @@ from sb3_por.analysis.fresh_heads import judgement, train_head
 from sb3_por.analysis.played import Played, encode, play
 from sb3_por.common.errors import UserError
 from sb3_por.evaluation.episodes import evaluation_episodes
-from sb3_por.evaluation.evaluate import EnvWrapper, make_evaluation_env
-from sb3_por.evaluation.loading import find_environment, load_model, trained_in
+from sb3_por.evaluation.environment import make_evaluation_env
+from sb3_por.evaluation.loading import resolve
 from sb3_por.objectives.por import PartialOrder
+from sb3_por.runs.environment import EnvWrapper, VecEnvWrapper
 from sb3_por.runs.facts import run_identity
 from sb3_por.runs.folder import find_runs, is_finished, last_model
 
@@ -133,26 +134,29 @@ def diagnose(
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
     env_wrapper: EnvWrapper | None = None,
+    vec_env_wrapper: VecEnvWrapper | None = None,
     fresh_head: bool = False,
 ) -> Diagnosis:
     """
     Play held-out episodes with a model and at random, and measure its partial-order objective on their frames.
 
-    :param model: trained with a ``PartialOrder`` objective
+    :param model: a run folder, the path of a model, or a model; trained with a ``PartialOrder`` objective
     :param env_id: a Gymnasium id; the controls need its ``info["monotone"]``
     :param n_episodes: number of episodes of each policy
     :param seed: seed of the first episode, the random policy, and the pairs; the global generators are set to it
-    :param env_kwargs: arguments of the environment's constructor
-    :param vec_normalize: file of the ``VecNormalize`` statistics from training
-    :param env_wrapper: the wrappers from training
+    :param env_kwargs: as in :func:`sb3_por.evaluation.evaluate`
+    :param vec_normalize: as in :func:`sb3_por.evaluation.evaluate`
+    :param env_wrapper: as in :func:`sb3_por.evaluation.evaluate`
+    :param vec_env_wrapper: as in :func:`sb3_por.evaluation.evaluate`
     :param fresh_head: also train fresh heads on other episodes of the policy and measure them on the same held-out frames: on
         the frozen encoder, on an untrained one, and with sham labels
     :raises UserError: if the model learns no order, or was not trained on this environment
     """
+    model, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
     objective = check_order(model)
     if n_episodes < 1:
         raise UserError(f"a diagnosis needs at least 1 episode, got {n_episodes}")
-    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize, env_wrapper)
+    env = make_evaluation_env(model, env_id, **environment)
     set_random_seed(seed)
     env.action_space.seed(seed)
     model.policy.set_training_mode(False)
@@ -211,11 +215,9 @@ def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int 
         file = run / last_model(identity["env"])
         if not is_finished(run, identity["env"]):
             continue
-        find_environment(identity["env"], file)
-        model: Any = load_model(file)
+        model, environment = resolve(file, identity["env"])
         if not isinstance(getattr(model.policy, "objective", None), PartialOrder):
             continue
-        environment = trained_in(file, identity["env"])
         measured = diagnose(model, identity["env"], n_episodes, seed, **environment, fresh_head=fresh_head).as_dict()
         del measured["correlations"]
         rows.append({**identity, "step": model.num_timesteps, **measured})

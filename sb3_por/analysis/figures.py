@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from sb3_por.analysis import plots, statistics
 from sb3_por.analysis.learning_curves import Grid, read_grid
+from sb3_por.analysis.names import ORDER
 from sb3_por.analysis.plot_style import FORMATS, save_figure
 from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write, check_output, check_writable
@@ -40,8 +41,7 @@ KINDS = {
     "improvement": Kind("How likely is one better than another?", statistics.improvements, plots.draw_improvements),
     "ratio": Kind("How far ahead of its best rival is each?", statistics.ratios, plots.draw_ratios),
 }
-#: The figure of POR's classifier, drawn from the order table instead of the scores.
-ORDER = "order"
+#: Title of the figure of POR's classifier, which is drawn from the order table instead of the scores.
 ORDER_TITLE = "What does the partial-order classifier learn?"
 
 

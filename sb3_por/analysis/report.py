@@ -21,7 +21,7 @@ from sb3_por.analysis.saliency import draw_saliency
 from sb3_por.analysis.scores import METRICS, RUN_KEYS, join_runs, read_csv, read_run
 from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write, check_writable
-from sb3_por.evaluation.loading import LOADABLE, find_environment, load_model, trained_in
+from sb3_por.evaluation.loading import LOADABLE, resolve
 from sb3_por.evaluation.video import record_video
 from sb3_por.runs.facts import RunFacts, orphaned_logs, take_inventory
 from sb3_por.runs.folder import BEST_MODEL, EVALUATIONS
@@ -239,9 +239,7 @@ def _show_models(best: Iterator[tuple[str, str, RunFacts, float]], notes: list[s
         with TemporaryDirectory() as folder:
             path = Path(folder) / "video.gif"
             try:
-                find_environment(env, run.folder)
-                model = load_model(run.folder, algo if algo in LOADABLE else None)
-                environment = trained_in(run.folder, env)
+                model, environment = resolve(run.folder, env, algo=algo if algo in LOADABLE else None)
                 record_video(model, env, path, size=VIDEO_SIZE, **environment)
                 title = f"{algo}, seed {run.seed}: best of its evaluations {_printed(score)}"
                 shown.setdefault(env, []).append(_picture(title, path))

@@ -12,8 +12,10 @@ from gymnasium import spaces
 from sb3_por.analysis.diagnostics import check_order
 from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write, check_output
+from sb3_por.evaluation.environment import make_evaluation_env
 from sb3_por.evaluation.episodes import evaluation_episodes
-from sb3_por.evaluation.evaluate import EnvWrapper, make_evaluation_env
+from sb3_por.evaluation.loading import resolve
+from sb3_por.runs.environment import EnvWrapper, VecEnvWrapper
 
 FORMATS = (".png", ".jpg")
 #: SmoothGrad: number of noisy copies that gradients are averaged over, and standard deviation of the noise (grey levels).
@@ -74,26 +76,29 @@ def draw_saliency(
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
     env_wrapper: EnvWrapper | None = None,
+    vec_env_wrapper: VecEnvWrapper | None = None,
 ) -> int:
     """
     Play the first held-out episode, and draw the saliency map of one of its frames.
 
-    :param model: trained with a ``PartialOrder`` objective on images
+    :param model: a run folder, the path of a model, or a model; trained with a ``PartialOrder`` objective on images
     :param env_id: a Gymnasium id
     :param path: ``.png`` or ``.jpg``
     :param step: number of the later frame; by default the one with the largest rise of ``info["monotone"]``
     :param seed: seed of the episode
-    :param env_kwargs: arguments of the environment's constructor
-    :param vec_normalize: file of the ``VecNormalize`` statistics from training
-    :param env_wrapper: the wrappers from training
+    :param env_kwargs: as in :func:`sb3_por.evaluation.evaluate`
+    :param vec_normalize: as in :func:`sb3_por.evaluation.evaluate`
+    :param env_wrapper: as in :func:`sb3_por.evaluation.evaluate`
+    :param vec_env_wrapper: as in :func:`sb3_por.evaluation.evaluate`
     :return: number of the drawn frame
     :raises UserError: if the model learns no order from images, or there is no such step
     """
+    model, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
     _, k = check_order(model).future or (1, 1)
     path = check_output(path, FORMATS)
     if not isinstance(model.observation_space, spaces.Box) or len(model.observation_space.shape) != 3:
         raise UserError(f"a saliency map needs a model that observes images alone, not {model.observation_space}")
-    env = make_evaluation_env(model, env_id, env_kwargs, vec_normalize, env_wrapper)
+    env = make_evaluation_env(model, env_id, **environment)
     try:
         env.env_method("play", evaluation_episodes(env_id, 1, seed))
         observation: Any = env.reset()

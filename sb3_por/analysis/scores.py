@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from sb3_por.analysis.names import METRICS
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.files import atomic_write
 from sb3_por.runs.facts import run_identity
@@ -13,7 +14,6 @@ from sb3_por.runs.folder import find_runs, read_evaluations, run_arguments
 
 #: Columns that identify a run, and columns that an evaluation measures.
 RUN_KEYS = ["env", "algo", "seed"]
-METRICS = ["normalized_performance", "return", "success"]
 COLUMNS = [*RUN_KEYS, "step", *METRICS, "wall_clock_s", "commit"]
 
 

@@ -1,9 +1,12 @@
-"""Errors that a user can mend, and the one place that shows them."""
+"""User errors and notes to users, and the function that prints them."""
 
 import difflib
 import os
 import sys
-from collections.abc import Callable, Iterable
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 #: A message lists the names there are if they are no more than these.
 MAX_LISTED = 20
@@ -13,17 +16,22 @@ class UserError(ValueError):
     """Something the user gave cannot be used. The message is one line: what was wrong, what to give instead."""
 
 
+class UserNote(UserWarning):
+    """Something that the user should know of a result. The message is one line."""
+
+
 def exit_code(command: Callable[[], object], prog: str) -> int:
     """
-    Run a command for the shell.
+    Run a command for the shell. Errors and notes of this package are printed as one line each.
 
-    :param command: called without arguments
-    :param prog: what the user typed, starts the message
-    :return: what the command returns if that is a number, else 0; 2 after a ``UserError``, shown as one line on stderr;
-        130 after Ctrl-C, 141 when whoever reads the output has gone (``| head``)
+    :param command: Function without arguments
+    :param prog: The command as the user typed it; begins the message of an error
+    :return: The command's result if that is a number, else 0; 2 after a ``UserError``, 130 after Ctrl-C, 141 if nobody reads
+        the output any more (``| head``)
     """
     try:
-        result = command()
+        with _notes_as_lines():
+            result = command()
         sys.stdout.flush()
     except UserError as error:
         print(f"{prog}: error: {error}", file=sys.stderr)
@@ -38,12 +46,29 @@ def exit_code(command: Callable[[], object], prog: str) -> int:
     return result if isinstance(result, int) else 0
 
 
+@contextmanager
+def _notes_as_lines() -> Iterator[None]:
+    """Print a ``UserNote`` without the line of code that it comes from."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def show_note(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, UserNote):
+                print(f"note: {message}", file=sys.stderr)
+            else:
+                show(message, category, *where, **more)
+
+        warnings.showwarning = show_note
+        warnings.simplefilter("always", UserNote)
+        yield
+
+
 def check_known(kind: str, name: str, known: Iterable[str]) -> None:
     """
-    :param kind: what the name is a name of, for the message
-    :param name: what the user gave
-    :param known: the names there are
-    :raises UserError: if the name is not known; says the nearest one
+    :param kind: Kind of thing that is named, for the message
+    :param name: Name that the user gave
+    :param known: Known names
+    :raises UserError: If the name is not known; the message has the nearest one
     """
     names = sorted(known)
     if name in names:

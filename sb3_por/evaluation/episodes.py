@@ -12,7 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.common.errors import UserError
-from softbody_envs.registration import ENV_IDS
+from softbody_envs.registration import task_class
 from softbody_envs.variations import SPLITS
 
 #: Seed of the first evaluation episode; the k-th has this plus k.
@@ -131,13 +131,13 @@ class FixedEpisodes(gym.Wrapper):
 def evaluation_episodes(env_id: str, n_episodes: int, seed: int = EVAL_SEED) -> list[Episode]:
     """The episodes of an evaluation: held-out variations 800, 801, ... with seeds ``seed``, ``seed + 1``, ..."""
     held_out = SPLITS["eval"]
-    has_variations = env_id in ENV_IDS
+    has_variations = task_class(env_id) is not None
     return [Episode(k, seed + k, held_out[k % len(held_out)] if has_variations else None) for k in range(n_episodes)]
 
 
 def evaluation_kwargs(env_id: str) -> dict[str, Any]:
-    """What the constructor of an evaluation environment gets besides what the training environment gets."""
-    return {"split": "eval"} if env_id in ENV_IDS else {}
+    """Arguments of the constructor of an evaluation environment that a training environment does not get."""
+    return {"split": "eval"} if task_class(env_id) is not None else {}
 
 
 def whole_episodes(env_kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Load any saved model for use: find its algorithm, name what is wrong with the file, allocate no replay buffer."""
+"""Loading of any saved model for use: with its algorithm and its environment, without its replay buffer."""
 
 import importlib
 import inspect
@@ -17,9 +17,10 @@ import stable_baselines3
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_por import ALGORITHMS
-from sb3_por.common.errors import UserError, check_known, one_line
-from sb3_por.evaluation.episodes import whole_episodes
-from sb3_por.evaluation.evaluate import EnvWrapper
+from sb3_por.common.errors import UserError, UserNote, check_known, one_line
+from sb3_por.evaluation.environment import observation_kwargs
+from sb3_por.evaluation.episodes import Model, whole_episodes
+from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, VecEnvWrapper, import_wrappers
 from sb3_por.runs.folder import (
     ARGUMENTS,
     BEST_MODEL,
@@ -89,48 +90,88 @@ def model_file(path: str | Path) -> Path:
     return path
 
 
-def settings_of(path: str | Path, env_id: str) -> Path:
+def resolve(
+    model: Model | str | Path,
+    env_id: str,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_normalize: str | None = None,
+    env_wrapper: EnvWrapper | None = None,
+    vec_env_wrapper: VecEnvWrapper | None = None,
+    algo: str | None = None,
+) -> tuple[Any, dict[str, Any]]:
     """
-    :param path: as :func:`load_model` takes it
-    :param env_id: the environment
-    :return: where the settings of the model's run are, if it has any
+    Load a model, and find out which environment it was trained in: from its run's folder, else from the model itself.
+
+    :param model: A run folder, the path of a model, or a model
+    :param env_id: Gymnasium id of the environment that the model is to be used in
+    :param env_kwargs: Changes to the arguments of the environment's constructor
+    :param vec_normalize: Replaces the file of ``VecNormalize`` statistics
+    :param env_wrapper: Replaces the wrappers
+    :param vec_env_wrapper: Replaces the wrappers of the vectorized environments
+    :param algo: Name of the algorithm, see :func:`load_model`
+    :return: The model, and the other arguments of :func:`sb3_por.evaluation.environment.make_evaluation_env`
+    :raises UserError: If the model cannot be loaded, or a wrapper cannot be imported
     """
-    return model_file(path).parent / env_id / HYPERPARAMETERS
+    given = {"vec_normalize": vec_normalize, "env_wrapper": env_wrapper, "vec_env_wrapper": vec_env_wrapper}
+    given = {name: value for name, value in given.items() if value is not None}
+    if isinstance(model, (str, Path)):
+        find_environment(env_id, model)
+        path, model = model, load_model(model, algo)
+        environment = trained_in(path, env_id)
+    else:
+        quiet = bool(given) or env_kwargs is not None
+        environment = _arguments(TrainingEnvironment.of_model(model), env_id, None, quiet)
+    if environment["env_kwargs"] is None:
+        environment["env_kwargs"] = observation_kwargs(env_id, model.observation_space)
+    environment["env_kwargs"] = environment["env_kwargs"] | (env_kwargs or {})
+    return model, environment | given
 
 
 def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
     """
-    The environment that a run's model was trained in, as far as its folder says.
-
-    :param path: as :func:`load_model` takes it
-    :param env_id: the environment
-    :return: the arguments ``env_kwargs``, ``vec_normalize`` and ``env_wrapper`` of :func:`sb3_por.evaluation.evaluate` and its
-        likes
-    :raises UserError: if a wrapper in its settings cannot be imported
+    :param path: A run folder, or the path of a model
+    :param env_id: Gymnasium id
+    :return: Arguments of :func:`sb3_por.evaluation.environment.make_evaluation_env`, besides model and id: from the run's
+        folder, else from the model's ``.zip``; None for what neither tells of this environment
+    :raises UserError: If a wrapper cannot be imported
     """
     file = model_file(path)
-    folder = file.parent / env_id
-    settings = read_settings(settings_of(path, env_id))
-    env_kwargs = settings.get("env_kwargs")
+    folder = file.parent / env_id.rpartition(":")[2]
+    if (folder / HYPERPARAMETERS).is_file():
+        made_of: TrainingEnvironment | None = TrainingEnvironment.of_settings(
+            folder.name, read_settings(folder / HYPERPARAMETERS)
+        )
+    else:
+        made_of = TrainingEnvironment.of_data(read_data(file))
+        if made_of is None:
+            warnings.warn(f"{file} does not tell how its environment was wrapped: {env_id} is made without wrappers", UserNote)
     of_best = folder / BEST_STATISTICS
     statistics = of_best if file.name == BEST_MODEL and of_best.is_file() else folder / STATISTICS
-    return {
-        "env_kwargs": whole_episodes(env_kwargs) if isinstance(env_kwargs, dict) else {},
-        "vec_normalize": str(statistics) if statistics.is_file() else None,
-        "env_wrapper": _env_wrapper(settings),
+    return _arguments(made_of, env_id, str(statistics) if statistics.is_file() else None)
+
+
+def _arguments(
+    made_of: TrainingEnvironment | None, env_id: str, statistics: str | None, quiet: bool = False
+) -> dict[str, Any]:
+    """Arguments of ``make_evaluation_env``, with a note on what they lack unless ``quiet``."""
+    arguments: dict[str, Any] = {
+        "env_kwargs": None,
+        "vec_normalize": statistics,
+        "env_wrapper": None,
+        "vec_env_wrapper": None,
     }
-
-
-def _env_wrapper(settings: dict[str, Any]) -> EnvWrapper | None:
-    """The wrappers that a run's settings name."""
-    if not settings.get("env_wrapper"):
-        return None
-    from rl_zoo3.utils import get_wrapper_class  # takes seconds to import
-
-    try:
-        return get_wrapper_class(settings)
-    except (AssertionError, AttributeError, ImportError, ValueError) as error:
-        raise UserError(f"cannot import the env_wrapper {settings['env_wrapper']}: {one_line(error)}") from error
+    if made_of is None:
+        return arguments
+    missing = made_of.normalizes_observations and statistics is None
+    if made_of.env_id == env_id.rpartition(":")[2]:
+        arguments["env_kwargs"] = whole_episodes(made_of.env_kwargs or {})
+        arguments["env_wrapper"] = import_wrappers(made_of.env_wrapper)
+        arguments["vec_env_wrapper"] = import_wrappers(made_of.vec_env_wrapper)
+    elif made_of.env_wrapper or made_of.vec_env_wrapper:
+        missing = True
+    if missing and not quiet:
+        warnings.warn(f"{env_id} is made without what the model was trained in: {made_of}", UserNote)
+    return arguments
 
 
 def import_packages(names: Iterable[str]) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_por.common.errors import UserError, check_known, one_line
 from softbody_envs.experts import EXPERT_IDS, make_expert
-from softbody_envs.registration import ENV_IDS
+from softbody_envs.registration import task_class
 
 
 class RandomModel:
@@ -80,7 +80,7 @@ REFERENCES = {"random": RandomModel, "nothing": IdleModel, "expert": ExpertModel
 
 def _spaces(env_id: str) -> tuple[gym.Space, Any]:
     try:
-        kwargs: dict[str, Any] = {"obs_type": "state"} if env_id in ENV_IDS else {}
+        kwargs: dict[str, Any] = {} if task_class(env_id) is None else {"obs_type": "state"}
         env = gym.make(env_id, **kwargs)
     except gym.error.Error as error:
         raise UserError(f"cannot make {env_id}: {one_line(error)}") from error

@@ -9,9 +9,11 @@ from gymnasium.wrappers import RenderCollection
 
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.files import atomic_write, check_output
+from sb3_por.evaluation.environment import make_evaluation_env
 from sb3_por.evaluation.episodes import EVAL_SEED, Evaluation, Model, evaluation_episodes, run_episodes
-from sb3_por.evaluation.evaluate import EnvWrapper, make_evaluation_env
-from softbody_envs.registration import ENV_IDS
+from sb3_por.evaluation.loading import resolve
+from sb3_por.runs.environment import EnvWrapper, VecEnvWrapper
+from softbody_envs.registration import task_class
 
 FORMATS = (".gif", ".mp4")
 
@@ -28,7 +30,7 @@ def check_video(path: str | Path) -> Path:
 
 
 def record_video(
-    model: Model,
+    model: Model | str | Path,
     env_id: str,
     path: str | Path,
     n_episodes: int = 1,
@@ -37,19 +39,21 @@ def record_video(
     env_kwargs: dict[str, Any] | None = None,
     vec_normalize: str | None = None,
     env_wrapper: EnvWrapper | None = None,
+    vec_env_wrapper: VecEnvWrapper | None = None,
 ) -> Evaluation:
     """
     Record a model's deterministic policy on the first held-out episodes.
 
-    :param model: an SB3 model
+    :param model: a run folder, the path of a model, or an SB3 model
     :param env_id: a Gymnasium id
     :param path: ``.gif`` or ``.mp4``
     :param n_episodes: number of episodes, one after the other
     :param seed: seed of the first episode
     :param size: height and width in pixels, for environments with a ``render_size``
-    :param env_kwargs: arguments of the environment's constructor
-    :param vec_normalize: file of the ``VecNormalize`` statistics from training
-    :param env_wrapper: the wrappers from training
+    :param env_kwargs: as in :func:`sb3_por.evaluation.evaluate`
+    :param vec_normalize: as in :func:`sb3_por.evaluation.evaluate`
+    :param env_wrapper: as in :func:`sb3_por.evaluation.evaluate`
+    :param vec_env_wrapper: as in :func:`sb3_por.evaluation.evaluate`
     :return: the scores of these episodes
     :raises UserError: if the environment does not fit the model or renders no images
     """
@@ -58,17 +62,19 @@ def record_video(
         raise UserError(f"a video needs at least 1 episode, got {n_episodes}")
     if size < 1:
         raise UserError(f"a video needs at least 1 pixel, got the size {size}")
-    rendering: dict[str, Any] = {"render_mode": "rgb_array"} | ({"render_size": size} if env_id in ENV_IDS else {})
-    kwargs = (env_kwargs or {}) | rendering
+    loaded, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
+    rendering: dict[str, Any] = {"render_mode": "rgb_array"} | ({} if task_class(env_id) is None else {"render_size": size})
+    wrap = environment["env_wrapper"]
 
     def recorded(env: gym.Env) -> gym.Env:
         innermost: gym.Env = RenderCollection(env, reset_clean=False)  # records every step inside an ActionRepeat
-        return innermost if env_wrapper is None else env_wrapper(innermost)
+        return innermost if wrap is None else wrap(innermost)
 
-    env = make_evaluation_env(model, env_id, kwargs, vec_normalize, recorded)
+    changes = {"env_kwargs": environment["env_kwargs"] | rendering, "env_wrapper": recorded}
+    env = make_evaluation_env(loaded, env_id, **environment | changes)
     try:
         fps = env.get_attr("metadata")[0].get("render_fps", 30)
-        evaluation = run_episodes(model, env, evaluation_episodes(env_id, n_episodes, seed))
+        evaluation = run_episodes(loaded, env, evaluation_episodes(env_id, n_episodes, seed))
         # The vectorised environment resets itself after the last episode: the last frame belongs to the next one.
         frames = env.env_method("render")[0][:-1]
     except gym.error.Error as error:

@@ -3,6 +3,7 @@
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -49,28 +50,72 @@ def intermediate_model(n_steps: int) -> str:
     return f"rl_model_{n_steps}_steps.zip"
 
 
-class _PlainDumper(yaml.SafeDumper):
-    """Writes YAML that every reader can read: what is no plain value becomes its ``repr``."""
+class _Dumper(yaml.SafeDumper):
+    """Writes plain YAML; tuples and classes with PyYAML's own tags, and other objects as their ``repr``."""
 
 
-_PlainDumper.add_multi_representer(object, lambda dumper, value: dumper.represent_str(repr(value)))
-_PlainDumper.add_multi_representer(dict, lambda dumper, value: dumper.represent_dict(value))
+class _Loader(yaml.SafeLoader):
+    """Reads what ``_Dumper`` writes. A class that cannot be imported stays the name of one."""
+
+
+def _represent_class(dumper: yaml.SafeDumper, value: type) -> yaml.Node:
+    return dumper.represent_scalar(f"{_NAME}{value.__module__}.{value.__qualname__}", "")
+
+
+def _construct_tuple(loader: yaml.SafeLoader, node: Any) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
+def _construct_class(loader: yaml.SafeLoader, name: str, _: yaml.Node) -> Any:
+    try:
+        return resolve_name(name)
+    except (AttributeError, ImportError, ValueError):
+        return name
+
+
+_TUPLE, _NAME = "tag:yaml.org,2002:python/tuple", "tag:yaml.org,2002:python/name:"
+_Dumper.add_multi_representer(object, lambda dumper, value: dumper.represent_str(repr(value)))
+_Dumper.add_multi_representer(dict, lambda dumper, value: dumper.represent_dict(value))
+_Dumper.add_representer(tuple, lambda dumper, value: dumper.represent_sequence(_TUPLE, value))
+_Dumper.add_multi_representer(type, _represent_class)
+_Loader.add_constructor(_TUPLE, _construct_tuple)
+_Loader.add_multi_constructor(_NAME, _construct_class)
+
+
+def dump_settings(settings: dict[str, Any]) -> str:
+    """
+    :param settings: Arguments or hyperparameters of a run
+    :return: YAML
+    """
+    return yaml.dump(settings, Dumper=_Dumper)
+
+
+def parse_settings(text: str) -> dict[str, Any]:
+    """
+    :param text: YAML that ``dump_settings`` wrote
+    :return: Names and values
+    :raises ValueError: If it is not YAML of names and values, or needs other Python objects
+    """
+    try:
+        return dict(yaml.load(text, _Loader) or {})
+    except (yaml.YAMLError, TypeError) as error:
+        raise ValueError(one_line(error)) from error
 
 
 def write_settings(path: Path, settings: dict[str, Any]) -> None:
-    """Write arguments or hyperparameters of a run as plain YAML."""
+    """Write arguments or hyperparameters of a run."""
     with atomic_write(path) as temporary:
-        temporary.write_text(yaml.dump(settings, Dumper=_PlainDumper))
+        temporary.write_text(dump_settings(settings))
 
 
 def read_settings(path: Path) -> dict[str, Any]:
     """
     :param path: Arguments or hyperparameters of a run
-    :return: Their names and values; empty if there is no such file, or one that holds Python objects
+    :return: Their names and values; empty if there is no such file, or one that holds other Python objects
     """
     try:
-        return dict(yaml.safe_load(path.read_text()) or {})
-    except (yaml.YAMLError, OSError, TypeError, ValueError):
+        return parse_settings(path.read_text())
+    except (OSError, ValueError):
         return {}
 
 

@@ -33,6 +33,7 @@ from sb3_por.runs.checkpoints import (
     restore_buffer,
     restore_monitors,
 )
+from sb3_por.runs.environment import TrainingEnvironment
 from sb3_por.runs.folder import (
     ARGUMENTS,
     BEST_STATISTICS,
@@ -93,6 +94,8 @@ class Experiment(ExperimentManager):
             saved = read_settings(self._resumed_run / self.env_name / HYPERPARAMETERS) | changes
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
+        if isinstance(saved.get("normalize"), str):  # the zoo's files have Python as text there
+            hyperparams["normalize"] = saved["normalize"] = eval(saved["normalize"])
         held_out = evaluation_kwargs(self.env_name.gym_id)
         self.eval_env_kwargs = {**whole_episodes(self.env_kwargs), **held_out, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved
@@ -131,9 +134,12 @@ class Experiment(ExperimentManager):
             raise UserError(f"another process is at work in {self.save_path}") from error
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """Settings that cannot work leave one line and no folder."""
+        """
+        Report settings that cannot work in one line, and leave no folder behind. Store in the model what its environment is
+        made of, so that its ``.zip`` can be evaluated alone.
+        """
         try:
-            return super().setup_experiment()
+            experiment = super().setup_experiment()
         except (AssertionError, TypeError, ValueError, RuntimeError, gym.error.Error) as error:
             if self._folder_made:
                 shutil.rmtree(self.save_path, ignore_errors=True)
@@ -141,6 +147,10 @@ class Experiment(ExperimentManager):
                 raise
             message = f"{self.algo} cannot be set up on {self.env_name.gym_id}: {one_line(error)} (--verbose 2 shows where)"
             raise UserError(message) from error
+        if experiment is not None:
+            model, settings = experiment
+            TrainingEnvironment.of_settings(self.env_name.gym_id, settings).store_in(model)
+        return experiment
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """Evaluation plays the same held-out episodes each time; the zoo's begin as the training environment does."""

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from rl_zoo3.wrappers import TimeFeatureWrapper
 from sb3_contrib import TQC
+from sb3_contrib.common.wrappers import TimeFeatureWrapper
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
-from sb3_por.common.errors import UserError
+from sb3_por.common.errors import UserError, UserNote
 from sb3_por.evaluation.episodes import Episode, Evaluation, FixedEpisodes, evaluation_episodes, run_episodes
 from sb3_por.evaluation.evaluate import evaluate
 from sb3_por.evaluation.loading import load_model, trained_in
@@ -109,11 +109,14 @@ def test_stacked_frames_and_normalised_observations_are_restored(tmp_path):
     (tmp_path / "Pendulum-v1").mkdir()
     env.venv.save(str(tmp_path / "Pendulum-v1" / "vecnormalize.pkl"))
     model.save(tmp_path / "best_model.zip")
-    environment = trained_in(tmp_path, "Pendulum-v1")
+    with pytest.warns(UserNote, match="Pendulum-v1 is made without wrappers"):
+        environment = trained_in(tmp_path, "Pendulum-v1")
     plain = evaluate(model, "Pendulum-v1", n_episodes=1)
     normalised = evaluate(model, "Pendulum-v1", n_episodes=1, **environment)
     assert plain.returns != normalised.returns
-    assert trained_in(tmp_path, "PourWater-v0") == {"env_kwargs": {}, "vec_normalize": None, "env_wrapper": None}
+    nothing = dict.fromkeys(("env_kwargs", "vec_normalize", "env_wrapper", "vec_env_wrapper"))
+    with pytest.warns(UserNote, match="does not tell how its environment was wrapped: PourWater-v0 is made without"):
+        assert trained_in(tmp_path, "PourWater-v0") == nothing
 
 
 def test_a_run_is_evaluated_in_the_environment_that_it_was_trained_in_but_on_whole_episodes(tmp_path):
@@ -122,7 +125,7 @@ def test_a_run_is_evaluated_in_the_environment_that_it_was_trained_in_but_on_who
     (tmp_path / "Pendulum-v1").mkdir()
     (tmp_path / "Pendulum-v1" / "config.yml").write_text("env_kwargs: {g: 1.0, max_episode_steps: 7}\n")
     environment = trained_in(tmp_path, "Pendulum-v1")
-    assert environment == {"env_kwargs": {"g": 1.0}, "vec_normalize": None, "env_wrapper": None}
+    assert environment["env_kwargs"] == {"g": 1.0} and environment["env_wrapper"] is None
     light = evaluate(model, "Pendulum-v1", n_episodes=1, **environment)
     assert light.lengths == [200]
     assert light.returns != evaluate(model, "Pendulum-v1", n_episodes=1).returns
@@ -130,7 +133,7 @@ def test_a_run_is_evaluated_in_the_environment_that_it_was_trained_in_but_on_who
 
 def test_a_run_is_evaluated_inside_the_wrappers_that_it_was_trained_in(tmp_path):
     clipped = "gymnasium.wrappers.ClipReward: {min_reward: -2000000.0, max_reward: -1000000.0}"
-    wrappers = f"env_wrapper:\n- rl_zoo3.wrappers.TimeFeatureWrapper\n- {clipped}\n"
+    wrappers = f"env_wrapper:\n- sb3_contrib.common.wrappers.TimeFeatureWrapper\n- {clipped}\n"
     (tmp_path / "FallingBall-v0").mkdir()
     (tmp_path / "FallingBall-v0" / "config.yml").write_text(wrappers)
     model = SAC("MlpPolicy", TimeFeatureWrapper(gym.make("FallingBall-v0", obs_type="state")), buffer_size=10, seed=0)
@@ -143,7 +146,7 @@ def test_a_run_is_evaluated_inside_the_wrappers_that_it_was_trained_in(tmp_path)
     with pytest.raises(UserError, match="was not trained on FallingBall-v0"):
         evaluate(model, "FallingBall-v0", n_episodes=1)
     (tmp_path / "FallingBall-v0" / "config.yml").write_text("env_wrapper: no_such_package.Wrapper\n")
-    with pytest.raises(UserError, match="cannot import the env_wrapper no_such_package"):
+    with pytest.raises(UserError, match="cannot import the wrapper no_such_package"):
         trained_in(tmp_path, "FallingBall-v0")
 
 

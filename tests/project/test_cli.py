@@ -53,7 +53,8 @@ def test_evaluate_prints_a_line(run, capsys):
     assert main(["evaluate", "--model", str(run / "best_model.zip"), "--env", "Pendulum-v1", "-n", "1"]) == 0
     line, note = capsys.readouterr()
     assert line.startswith("return -") and line.endswith("length 200 (1 episode)\n")
-    assert note == f"note: there is no {run}/Pendulum-v1/config.yml: Pendulum-v1 is made without the training's wrappers\n"
+    file = run / "best_model.zip"
+    assert note == f"note: {file} does not tell how its environment was wrapped: Pendulum-v1 is made without wrappers\n"
 
 
 def test_evaluate_knows_the_two_ends_of_the_scale(capsys):

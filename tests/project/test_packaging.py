@@ -95,6 +95,7 @@ def test_a_wheel_holds_the_hyperparameters_and_the_page_and_finds_them(tmp_path,
     installed = {path.name for path in (tmp_path / "installed" / "sb3_por" / "zoo_hyperparams").glob("*.yml")}
     assert installed == {path.name for path in (ROOT / "zoo_hyperparams").glob("*.yml")}
     assert (tmp_path / "installed" / "sb3_por" / "analysis" / "report.html.jinja").is_file()
+    assert all((tmp_path / "installed" / package / "py.typed").is_file() for package in PACKAGES)
     script = "from sb3_por.training.arguments import hyperparameter_file as f; print(f('sac_por', 'PourWater-v0'))"
     shown = subprocess.run(
         [sys.executable, "-c", script],

@@ -1,0 +1,115 @@
+"""What a run's training environment is made of, as its settings name it, and how to import that."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from pkgutil import resolve_name
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_por.common.errors import UserError, one_line
+from sb3_por.runs.folder import dump_settings, parse_settings
+
+#: A function that wraps an environment
+EnvWrapper = Callable[[gym.Env], gym.Env]
+#: A function that wraps vectorized environments
+VecEnvWrapper = Callable[[VecEnv], VecEnv]
+#: Attribute of a model that holds the text of a ``TrainingEnvironment``; saved in its ``.zip``
+ATTRIBUTE = "training_environment"
+
+
+@dataclass(frozen=True)
+class TrainingEnvironment:
+    """
+    The parts of a run's hyperparameters that decide what a policy sees and how its actions act.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: Arguments of the environment's constructor
+    :param env_wrapper: Wrappers of each environment, see :func:`import_wrappers`
+    :param vec_env_wrapper: Wrappers of the vectorized environments, in the same form
+    :param frame_stack: Number of stacked frames
+    :param normalize: Whether ``VecNormalize`` was used, or its arguments
+    """
+
+    env_id: str
+    env_kwargs: dict[str, Any] | None = None
+    env_wrapper: Any = None
+    vec_env_wrapper: Any = None
+    frame_stack: int | None = None
+    normalize: Any = None
+
+    @classmethod
+    def of_settings(cls, env_id: str, settings: dict[str, Any]) -> "TrainingEnvironment":
+        """
+        :param env_id: Gymnasium id
+        :param settings: Hyperparameters of a run
+        :return: The part of them that concerns the environment
+        """
+        names = [field.name for field in fields(cls) if field.name != "env_id"]
+        return cls(env_id, **{name: settings.get(name) for name in names})
+
+    @classmethod
+    def of_model(cls, model: Any) -> "TrainingEnvironment | None":
+        """
+        :param model: An SB3 model
+        :return: What ``train.py`` stored in it; None for a model that was trained otherwise
+        """
+        return cls.of_data(vars(model)) if hasattr(model, "__dict__") else None
+
+    @classmethod
+    def of_data(cls, data: dict[str, Any]) -> "TrainingEnvironment | None":
+        """
+        :param data: Attributes of an SB3 model
+        :return: As :meth:`of_model`
+        """
+        text = data.get(ATTRIBUTE)
+        return cls(**parse_settings(text)) if isinstance(text, str) else None
+
+    @property
+    def normalizes_observations(self) -> bool:
+        """Whether a policy needs the statistics of ``VecNormalize``."""
+        kwargs = self.normalize if isinstance(self.normalize, dict) else {}
+        return bool(self.normalize) and kwargs.get("norm_obs", True)
+
+    def __str__(self) -> str:
+        """Wrappers and normalization, for messages."""
+        named = {"env_wrapper": self.env_wrapper, "vec_env_wrapper": self.vec_env_wrapper, "normalize": self.normalize}
+        return f"{self.env_id} with " + ", ".join(f"{name} {value}" for name, value in named.items() if value)
+
+    def store_in(self, model: Any) -> None:
+        """
+        Make ``model.save()`` store this in the ``.zip``, so that a model without its run's folder can be evaluated.
+
+        :param model: An SB3 model
+        """
+        setattr(model, ATTRIBUTE, dump_settings(asdict(self)))
+
+
+def import_wrappers(spec: Any) -> Callable[[Any], Any] | None:
+    """
+    Import wrappers by their paths.
+
+    :param spec: The path of a wrapper, ``{path: arguments}``, or a list of them, the innermost first, as in the RL Zoo
+    :return: A function that puts them around an environment; None for none
+    :raises UserError: If one cannot be imported
+    """
+    if not spec:
+        return None
+    wrappers = [_import_wrapper(one) for one in (spec if isinstance(spec, list) else [spec])]
+
+    def wrap(env: Any) -> Any:
+        for wrapper in wrappers:
+            env = wrapper(env)
+        return env
+
+    return wrap
+
+
+def _import_wrapper(spec: Any) -> Callable[[Any], Any]:
+    path, arguments = next(iter(spec.items())) if isinstance(spec, dict) and len(spec) == 1 else (spec, None)
+    try:
+        return partial(resolve_name(path) if isinstance(path, str) else path, **(arguments or {}))
+    except (AttributeError, ImportError, TypeError, ValueError) as error:
+        raise UserError(f"cannot import the wrapper {path}: {one_line(error)}") from error

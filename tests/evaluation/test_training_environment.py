@@ -1,0 +1,149 @@
+"""A model is evaluated in the environment that it was trained in, from a run's folder, a path or the model alone."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack
+
+from sb3_por.common.errors import UserError, UserNote
+from sb3_por.evaluation import evaluate
+from sb3_por.evaluation.loading import resolve
+from sb3_por.runs.environment import TrainingEnvironment, import_wrappers
+from sb3_por.runs.folder import dump_settings, parse_settings
+from sb3_por.training.zoo import main
+from softbody_envs.registration import task_class
+from softbody_envs.tasks.falling_ball import FallingBallEnv
+from softbody_envs.wrappers import ActionRepeat
+
+ROOT = Path(__file__).parents[2]
+REPEAT = {"softbody_envs.wrappers.ActionRepeat": {"repeat": 5, "scale": 0.5}}
+CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": -1.0, "max_reward": 0.0}}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of train.py with wrappers; its rewards are clipped, its actions repeated."""
+    folder = tmp_path_factory.mktemp("logs")
+    settings = [f"env_wrapper:{[CLIP, REPEAT]}", "learning_starts:10", "batch_size:8", "policy:MlpPolicy"]
+    flags = ["--algo", "sac", "--env", "Pendulum-v1", "-n", "40", "--eval-freq", "40", "--eval-episodes", "1", "--seed", "1"]
+    assert main([*flags, "-f", str(folder), "-params", *settings]) == 0
+    return folder / "sac" / "Pendulum-v1_1"
+
+
+def test_the_same_scores_from_folder_path_and_model(run, tmp_path):
+    expected = evaluate(run, "Pendulum-v1", n_episodes=2)
+    assert expected.lengths == [200, 200]
+    alone = tmp_path / "model.zip"
+    alone.write_bytes((run / "best_model.zip").read_bytes())
+    for model in (run / "best_model.zip", str(alone), SAC.load(alone)):
+        assert evaluate(model, "Pendulum-v1", n_episodes=2) == expected
+    with np.load(run / "evaluations.npz") as file:
+        assert expected.returns[0] == pytest.approx(file["results"][0, 0])
+    bare = evaluate(SAC.load(alone), "Pendulum-v1", n_episodes=2, env_wrapper=lambda env: env)
+    assert bare != expected
+
+
+def test_a_loaded_model_that_is_saved_again_still_knows_its_environment(run, tmp_path):
+    SAC.load(run / "best_model.zip").save(tmp_path / "again.zip")
+    made_of = TrainingEnvironment.of_model(SAC.load(tmp_path / "again.zip"))
+    assert made_of.env_id == "Pendulum-v1" and made_of.env_wrapper == [CLIP, REPEAT]
+
+
+def test_another_environment_without_the_wrappers_is_noted(run):
+    gym.register("OtherPendulum-v1", gym.spec("Pendulum-v1").entry_point, max_episode_steps=10)
+    try:
+        for model in (SAC.load(run / "best_model.zip"), run / "best_model.zip"):
+            with pytest.warns(UserNote, match=r"OtherPendulum-v1 is made without .* Pendulum-v1 with env_wrapper"):
+                evaluate(model, "OtherPendulum-v1", n_episodes=1)
+    finally:
+        gym.registry.pop("OtherPendulum-v1")
+
+
+def test_a_model_whose_statistics_are_missing_is_noted():
+    model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=10)
+    TrainingEnvironment("Pendulum-v1", normalize={"norm_obs": False}).store_in(model)
+    assert resolve(model, "Pendulum-v1")[1]["vec_normalize"] is None
+    TrainingEnvironment("Pendulum-v1", normalize=True).store_in(model)
+    with pytest.warns(UserNote, match="made without what the model was trained in: Pendulum-v1 with normalize True"):
+        resolve(model, "Pendulum-v1")
+
+
+def test_evaluation_of_a_run_with_wrappers_leaves_gymnasium_alone(run):
+    script = f"""
+import sys, gymnasium
+before = gymnasium.wrappers.TimeLimit, gymnasium.envs.registration.load_env_creator("gymnasium.wrappers:TimeLimit")
+from sb3_por.evaluation import evaluate
+assert evaluate({str(run)!r}, "Pendulum-v1", n_episodes=1).lengths == [200]
+assert gymnasium.wrappers.TimeLimit is before[0] and gymnasium.wrappers.common.TimeLimit is before[1]
+assert not any(name.partition(".")[0] == "rl_zoo3" for name in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_stacked_dict_observations_are_restored():
+    env = VecFrameStack(make_vec_env("FallingBall-v0", env_kwargs={"obs_type": "dict", "image_size": 36}), 3)
+    model = SAC("MultiInputPolicy", env, buffer_size=10)
+    assert evaluate(model, "FallingBall-v0", n_episodes=1).lengths == [50]
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        "softbody_envs.wrappers.ActionRepeat",
+        {"softbody_envs.wrappers.ActionRepeat": {"repeat": 2}},
+        {ActionRepeat: {"repeat": 2}},
+        ["gymnasium.wrappers.TimeAwareObservation", {"softbody_envs.wrappers.ActionRepeat": {"repeat": 2}}],
+    ],
+)
+def test_wrappers_are_named_as_in_the_zoo(spec):
+    arguments = {} if spec != "softbody_envs.wrappers.ActionRepeat" else {"repeat": 2}
+    wrap = import_wrappers({spec: arguments} if arguments else spec)
+    env = wrap(gym.make("Pendulum-v1"))
+    assert isinstance(env, ActionRepeat) and env.repeat == 2
+    assert isinstance(env.env, gym.wrappers.TimeAwareObservation) == isinstance(spec, list)
+
+
+@pytest.mark.parametrize("spec", ["no_such.Wrapper", "gymnasium.wrappers.NoSuch", "nothing", {"a": {}, "b": {}}, 3])
+def test_what_is_no_wrapper_is_said(spec):
+    with pytest.raises(UserError, match="cannot import the wrapper"):
+        import_wrappers(spec)
+
+
+def test_settings_keep_tuples_and_classes():
+    settings = {
+        "shape": (36, 36),
+        "dtype": np.float32,
+        "nested": [{"gymnasium.wrappers.ResizeObservation": {"shape": (4, 4)}}],
+    }
+    assert parse_settings(dump_settings(settings)) == settings
+    assert parse_settings("a: !!python/name:no_such.thing ''") == {"a": "no_such.thing"}
+    with pytest.raises(ValueError, match="could not determine a constructor"):
+        parse_settings("a: !!python/object/apply:os.getcwd []")
+
+
+class OwnBall(FallingBallEnv):
+    """The task with another reward, as users write it."""
+
+    def reward(self):
+        return 0.5
+
+
+def test_a_users_own_task_is_scored_on_held_out_scenes():
+    gym.register("OwnBall-v0", OwnBall, max_episode_steps=20)
+    gym.register("SmallBall-v0", gym.spec("FallingBall-v0").entry_point, kwargs={"image_size": 36}, max_episode_steps=20)
+    try:
+        for env_id in ("OwnBall-v0", "SmallBall-v0"):
+            model = SAC("CnnPolicy", gym.make(env_id, image_size=36), buffer_size=10)
+            evaluation = evaluate(model, env_id, n_episodes=2)
+            assert evaluation.variations == [800, 801] and evaluation.lengths == [20, 20]
+        assert task_class("OwnBall-v0") is OwnBall and task_class("Pendulum-v1") is None
+    finally:
+        gym.registry.pop("OwnBall-v0")
+        gym.registry.pop("SmallBall-v0")

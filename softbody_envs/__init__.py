@@ -6,19 +6,14 @@ from softbody_envs.sim.banner import no_banner
 
 try:
     with no_banner():
-        import pybullet
-except ImportError as error:  # pragma: no cover - depends on the machine
+        import pybullet  # noqa: F401
+except ImportError as error:
+    # The two distributions share these files: removing one of them breaks the other.
     raise ImportError(
-        "softbody_envs needs pybullet 3.2.7. It has wheels for CPython 3.10 and 3.11 only "
-        f"(this is Python {sys.version_info.major}.{sys.version_info.minor}): "
-        "use Python 3.10 or 3.11, or build pybullet from source with numpy installed."
+        "softbody_envs needs the module pybullet, from the distribution pybullet or its fork pybullet-arm64, not both: "
+        "`pip uninstall -y pybullet pybullet-arm64`, then install this project again, on Python 3.10 to 3.13 "
+        f"(this is {sys.version_info.major}.{sys.version_info.minor})."
     ) from error
-
-if not pybullet.isNumpyEnabled():  # pragma: no cover - depends on the build
-    raise ImportError(
-        "This pybullet was built without numpy and would return images as tuples (bullet#4523): "
-        "install numpy first, then `pip install --no-build-isolation --no-binary pybullet pybullet==3.2.7`."
-    )
 
 from softbody_envs.registration import ENV_IDS, register_envs
 

@@ -1,6 +1,7 @@
 """Cameras and the two renderers: TinyRenderer (any machine) and EGL (a machine with a graphics driver)."""
 
 import importlib.util
+import struct
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -86,6 +87,9 @@ class Renderer:
             renderer=self._flag,
             flags=pybullet.ER_NO_SEGMENTATION_MASK,
         )
+        if isinstance(rgba, tuple):  # a pybullet built without numpy; these two are ten times faster than np.asarray
+            rgba = np.frombuffer(bytearray(rgba), np.uint8)
+            depth = np.frombuffer(struct.pack(f"{size * size}f", *depth), np.float32)
         bodies = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4)[:, :, :3]
         depth = np.asarray(depth, dtype=np.float32).reshape(size, size)
         return np.where(depth[:, :, None] < NOTHING, bodies, backdrop(camera, size, world.floor)), depth

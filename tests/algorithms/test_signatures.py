@@ -10,7 +10,7 @@ from stable_baselines3 import SAC
 import sb3_por
 from sb3_por.objectives.base import Objective
 
-CLASSES = [getattr(sb3_por, name) for name in sb3_por.__all__ if name != "ALGORITHMS"]
+CLASSES = [value for name in sb3_por.__all__ if isinstance(value := getattr(sb3_por, name), type)]
 PARENTS = {cls: TQC if issubclass(cls, TQC) else SAC for cls in CLASSES}
 #: Defaults in which a class differs from the one that it extends
 OTHER_DEFAULTS = {("SACDrQ", "n_augmentations"), ("SACDrQ", "n_target_augmentations")}

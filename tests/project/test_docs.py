@@ -151,6 +151,7 @@ def test_python_runs(name, number, block, tmp_path, monkeypatch):
     block = re.sub(r"\.learn\([\d_]+", ".learn(110", block)
     block = re.sub(r"n_episodes=\d+", "n_episodes=1", block)
     block = re.sub(r"buffer_size=[\d_]+", "buffer_size=200", block)
+    block = re.sub(r"batch_size=\d+", "batch_size=8", block)
     exec(compile(block, name, "exec"), {})
 
 

@@ -79,11 +79,17 @@ class Parser(argparse.ArgumentParser):
 
     def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]
         self.set_defaults(**DEFAULTS, progress=sys.stderr.isatty())
-        self.add_argument("--resume", metavar="RUN_FOLDER", help="go on with a killed run; its folder has the settings")
+        self.add_argument(
+            "--resume",
+            metavar="RUN_FOLDER",
+            help="resume an interrupted run with the settings in its folder, or extend a finished one to -n steps",
+        )
         self.add_argument("--label", metavar="NAME", help="what tables and figures call the run, instead of its algorithm")
         args = super().parse_args()
         if args.resume:
             return self._resumed(Path(args.resume))
+        if args.trial_id is not None and not (args.storage and args.study_name):
+            raise UserError("--trial-id needs the --storage and the --study-name of the search")
         if args.track and importlib.util.find_spec("wandb") is None:
             raise UserError("--track needs Weights & Biases: pip install wandb")
         check_known("algorithm", args.algo, ALGOS)
@@ -106,13 +112,16 @@ class Parser(argparse.ArgumentParser):
         saved = run_arguments(run)
         if "env" not in saved:
             raise UserError(f"{run} is not the folder of a run: no */{ARGUMENTS} in it; give <log-folder>/<algo>/<env>_<n>")
-        if (run / last_model(saved["env"])).exists() and latest_checkpoint(run) is None:
-            remove_checkpoints(run)  # what is left of them if the run was killed while it removed them
-            print(f"{run} is finished: nothing to do (train.py -i MODEL.zip begins a new run with its model)")
-            raise SystemExit(0)
         self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
         args = super().parse_args()
         args.resume = str(run)
+        last = run / last_model(saved["env"])
+        if last.exists() and latest_checkpoint(run) is None:
+            remove_checkpoints(run)  # remains of them, if the run was killed while it removed them
+            done = read_data(last)["num_timesteps"]
+            if args.n_timesteps <= done:
+                print(f"{run} is finished: nothing to do. Pass -n with more than its {done} steps to extend it.")
+                raise SystemExit(0)
         import_packages(args.gym_packages)
         check_writable(run)
         return args

@@ -184,10 +184,17 @@ class CheckpointCallback(BaseCallback):
     :param env_id: the environment
     :param stopwatch: of the run
     :param rng_state: states of the random generators to begin with
+    :param at_start: save a checkpoint first: a finished run that is extended is an interrupted one from then on
     """
 
     def __init__(
-        self, save_freq: int, run: str | Path, env_id: str, stopwatch: Stopwatch, rng_state: dict[str, Any] | None = None
+        self,
+        save_freq: int,
+        run: str | Path,
+        env_id: str,
+        stopwatch: Stopwatch,
+        rng_state: dict[str, Any] | None = None,
+        at_start: bool = False,
     ) -> None:
         super().__init__()
         self.stopwatch = stopwatch
@@ -195,6 +202,7 @@ class CheckpointCallback(BaseCallback):
         self.run = Path(run)
         self.env_id = env_id
         self.rng_state = rng_state
+        self.at_start = at_start
         self.stop_requested = False
 
     def _on_training_start(self) -> None:
@@ -203,6 +211,9 @@ class CheckpointCallback(BaseCallback):
             set_rng_state(self.rng_state, self.model.action_space)
 
     def _on_rollout_start(self) -> None:
+        if self.at_start:
+            self.at_start = False
+            self._save_checkpoint()
         if self._count_due() > self._n_due:
             self._n_due = self._count_due()
             with atomic_write(self.run / intermediate_model(self.model.num_timesteps)) as path:

@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 import softbody_envs  # noqa: F401  (registers its ids)
-from sb3_por.common.errors import UserError, one_line
+from sb3_por.common.errors import UserError, UserNote, one_line
 from sb3_por.common.files import atomic_write, remove_unfinished
 from sb3_por.evaluation.episodes import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
 from sb3_por.evaluation.loading import quiet_n_steps
@@ -38,16 +39,19 @@ from sb3_por.runs.folder import (
     ARGUMENTS,
     BEST_STATISTICS,
     COMMAND,
+    EVALUATIONS,
     HYPERPARAMETERS,
     LOCK,
     REPLAY_BUFFER,
     STATISTICS,
     TENSORBOARD,
     last_model,
+    read_evaluations,
     read_settings,
     write_settings,
 )
 from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
+from sb3_por.training.trials import trial_settings
 
 
 def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
@@ -79,13 +83,22 @@ class Experiment(ExperimentManager):
         self._interrupted = False
         self._resumed_run = Path(self.args.resume) if self.args.resume else None
         self._checkpoint = latest_checkpoint(self._resumed_run) if self._resumed_run else None
-        if self._checkpoint:
-            self.trained_agent = str(self._checkpoint / MODEL)
+        last = self._resumed_run / last_model(self.env_name.gym_id) if self._resumed_run else None
+        self._extends = self._checkpoint is None and last is not None and last.is_file()
+        start = last if self._extends else self._checkpoint / MODEL if self._checkpoint else None
+        if start is not None:
+            self.trained_agent = str(start)
             self.continue_training = True
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """``--env-kwargs`` and ``-params env_kwargs:`` add to the file's (the zoo's replace them), also in evaluation."""
+        """
+        ``--env-kwargs`` and ``-params env_kwargs:`` add to the file's (the zoo's replace them), also in evaluation. A study
+        gives its best trial or the one with a number, 0 included.
+        """
         changes = dict(self.custom_hyperparams or {})
+        if self.storage and self.study_name and not self.optimize_hyperparameters and self._resumed_run is None:
+            changes = trial_settings(self.algo, self.storage, self.study_name, self.trial_id) | changes
+        self.trial_id = None
         given, self.env_kwargs = {**(changes.pop("env_kwargs", None) or {}), **self.env_kwargs}, {}
         self.custom_hyperparams = changes
         if self._resumed_run is None:
@@ -113,7 +126,7 @@ class Experiment(ExperimentManager):
         if self._resumed_run is not None:
             self.save_path = str(self._resumed_run)
             # Monitor begins its file anew by default.
-            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": self._checkpoint is None}
+            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": not self.continue_training}
         self.params_path = os.path.join(self.save_path, self.env_name)
         os.makedirs(self.params_path, exist_ok=True)
         self._folder_made = self._resumed_run is None
@@ -153,9 +166,12 @@ class Experiment(ExperimentManager):
         return experiment
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """Evaluation plays the same held-out episodes each time; the zoo's begin as the training environment does."""
+        """
+        Evaluation plays the same held-out episodes each time; the zoo's begin as the training environment does.
+        ``VecNormalize`` is the outermost wrapper, since the replay buffer stores what it receives.
+        """
         if not eval_env:
-            return super().create_envs(n_envs, no_log=no_log)
+            return super()._maybe_normalize(super().create_envs(n_envs, no_log=no_log), eval_env)
         inner = self.env_wrapper
         self.env_wrapper = FixedEpisodes if inner is None else lambda env: FixedEpisodes(inner(env))
         try:
@@ -163,13 +179,17 @@ class Experiment(ExperimentManager):
         finally:
             self.env_wrapper = inner
         env.env_method("play", evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes))
+        return super()._maybe_normalize(env, eval_env)
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        """Leave it to ``create_envs``; the zoo normalizes inside of the frame stack."""
         return env
 
     def create_callbacks(self) -> None:
         """Our evaluation and checkpoints, counted in environment steps."""
         if self.show_progress:
             self.callbacks.append(ProgressBarCallback())
-        stopwatch = Stopwatch(read_seconds(self._checkpoint) if self._checkpoint else 0.0)
+        stopwatch = Stopwatch(self._seconds_before())
         if self.eval_freq > 0 and not self.optimize_hyperparameters:
             self.callbacks.append(
                 EvaluationCallback(
@@ -184,8 +204,16 @@ class Experiment(ExperimentManager):
             )
         if not self.optimize_hyperparameters:
             rng_state = read_rng_state(self._checkpoint) if self._checkpoint else None
-            self._checkpoints = CheckpointCallback(self.save_freq, self.save_path, self.env_name.gym_id, stopwatch, rng_state)
+            self._checkpoints = CheckpointCallback(
+                self.save_freq, self.save_path, self.env_name.gym_id, stopwatch, rng_state, at_start=self._extends
+            )
             self.callbacks.append(self._checkpoints)
+
+    def _seconds_before(self) -> float:
+        """Seconds that a resumed run has taken before."""
+        if self._extends and self._resumed_run is not None and (self._resumed_run / EVALUATIONS).is_file():
+            return float(read_evaluations(self._resumed_run).get("wall_clock_s", np.zeros(1))[-1])
+        return read_seconds(self._checkpoint) if self._checkpoint else 0.0
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         """From a checkpoint, the replay buffer, too; and scenes that were not drawn at the beginning of the run."""
@@ -193,6 +221,13 @@ class Experiment(ExperimentManager):
             model = super()._load_pretrained_agent(hyperparams, env)
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
+        if self._extends and getattr(model, "replay_buffer", None) is not None and model.replay_buffer.size() == 0:
+            warnings.warn(
+                f"{self.save_path} has no {REPLAY_BUFFER}, which --save-replay-buffer writes: training continues with an "
+                "empty replay buffer",
+                UserNote,
+            )
+        if self._resumed_run is not None:
             env.seed((self.seed + model.num_timesteps) % 2**32)
         return model
 
@@ -218,7 +253,7 @@ class Experiment(ExperimentManager):
         if self.log_interval != -1:
             kwargs["log_interval"] = self.log_interval if self.log_interval > -1 else None
         n_timesteps = self.n_timesteps
-        if self._checkpoint:
+        if self._checkpoint or self._extends:  # the total
             n_timesteps = max(n_timesteps, model._total_timesteps) - model.num_timesteps
         handlers = {number: signal.signal(number, self._request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
         try:

@@ -275,3 +275,30 @@ def test_resume_of_what_is_finished_no_run_or_in_use_is_said(tmp_path, capsys):
     assert "another process is at work in" in capsys.readouterr().err
     holder.communicate(b"\n")
     assert (run / "Pendulum-v1" / "args.yml").exists()
+
+
+@pytest.mark.parametrize("keeps_buffer", [True, False])
+def test_a_finished_run_is_extended_in_its_folder(keeps_buffer, tmp_path, capsys, monkeypatch):
+    flags = ["-n", "60", "--eval-freq", "60", "--eval-episodes", "1", "-f", str(tmp_path)]
+    assert main([*FLAGS, *flags, *(["--save-replay-buffer"] if keeps_buffer else []), *SMALL]) == 0
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    with pytest.raises(SystemExit) as exit:
+        main(["--resume", str(run), "-n", "60"])
+    assert exit.value.code == 0 and "Pass -n with more than its 60 steps" in capsys.readouterr().out
+    sizes = []
+    with monkeypatch.context() as patch:
+
+        def die(callback):
+            sizes.append(callback.model.replay_buffer.size())
+            raise RuntimeError("killed")
+
+        patch.setattr("sb3_por.training.experiment.CheckpointCallback._on_step", die)
+        with pytest.raises(RuntimeError, match="killed"):
+            main(["--resume", str(run), "-n", "90"])
+    assert sizes == [60 if keeps_buffer else 0]
+    assert ("has no replay_buffer.pkl" in capsys.readouterr().err) != keeps_buffer
+    assert latest_checkpoint(run).name == "step_60", "an interrupted run from its first step on"
+    assert main(["--resume", str(run)]) == 0
+    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 90
+    with np.load(run / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [60, 90] and (np.diff(file["wall_clock_s"]) > 0).all()

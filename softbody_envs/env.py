@@ -73,6 +73,9 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
             raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
+        for name, size in (("image_size", image_size), ("render_size", render_size)):
+            if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
+                raise ValueError(f"{name} must be a positive number of pixels, got {size!r}")
         self.obs_type = obs_type
         self.image_size = image_size
         self.split = split

@@ -1,7 +1,7 @@
 """Checks of constructor arguments: of their types, from the annotations, and of their ranges."""
 
 import inspect
-import math
+import sys
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -33,7 +33,7 @@ def check_ranges(values: Mapping[str, Any], ranges: Mapping[str, tuple[float, fl
     for name, (low, high) in ranges.items():
         value = values.get(name)
         if isinstance(value, Real) and not low <= float(value) <= high:
-            limit = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
+            limit = f"between {low:g} and {high:g}" if high < sys.float_info.max else f"a finite number of at least {low:g}"
             raise ValueError(f"{name} must be {limit}, got {value!r}")
 
 

@@ -34,7 +34,7 @@ def exit_code(command: Callable[[], object], prog: str) -> int:
             result = command()
         sys.stdout.flush()
     except UserError as error:
-        print(f"{prog}: error: {error}", file=sys.stderr)
+        print(f"{prog}: error: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
         print(f"{prog}: {interrupt or 'interrupted'}", file=sys.stderr)

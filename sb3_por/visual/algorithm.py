@@ -1,7 +1,6 @@
 """Set-up, saving and loading of the visual algorithms."""
 
 import io
-import math
 import pathlib
 import sys
 import warnings
@@ -25,16 +24,17 @@ from sb3_por.visual.batch import Augmentation
 from sb3_por.visual.normalization import transpose_inside
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 
+MAX = sys.float_info.max
 #: Smallest and largest value of each numeric argument
 RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("tau", "encoder_tau", "gamma"), (0, 1)),
-    **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "train_freq"), (1, math.inf)),
-    **dict.fromkeys(("actor_update_interval", "target_update_interval", "diagnostics_interval"), (1, math.inf)),
-    **dict.fromkeys(("n_augmentations", "n_target_augmentations"), (1, math.inf)),
-    **dict.fromkeys(("learning_rate", "learning_starts", "augmentation_pad", "por_coef"), (0, math.inf)),
-    **dict.fromkeys(("ent_coef_lr_ratio", "aux_lr_ratio", "ent_coef"), (0, math.inf)),
-    "gradient_steps": (-1, math.inf),
-    "reward_scale": (-sys.float_info.max, sys.float_info.max),
+    **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "train_freq"), (1, MAX)),
+    **dict.fromkeys(("actor_update_interval", "target_update_interval", "diagnostics_interval"), (1, MAX)),
+    **dict.fromkeys(("n_augmentations", "n_target_augmentations"), (1, MAX)),
+    **dict.fromkeys(("learning_rate", "learning_starts", "augmentation_pad", "por_coef"), (0, MAX)),
+    **dict.fromkeys(("ent_coef_lr_ratio", "aux_lr_ratio", "ent_coef"), (0, MAX)),
+    "gradient_steps": (-1, MAX),
+    "reward_scale": (-MAX, MAX),
 }
 
 
@@ -118,6 +118,8 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         # Not those that SB3 has replaced by objects
         values = {name: value for name, value in vars(self).items() if name not in ("env", "policy", "device")}
         check_types(type(self), values)
+        if callable(self.learning_rate):
+            values["learning_rate"] = self.learning_rate(1.0)
         check_ranges(values, RANGES)
         check_precision(self.precision)
 

@@ -221,7 +221,8 @@ class Experiment(ExperimentManager):
             model = super()._load_pretrained_agent(hyperparams, env)
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
-        if self._extends and getattr(model, "replay_buffer", None) is not None and model.replay_buffer.size() == 0:
+        buffer = getattr(model, "replay_buffer", None)
+        if self._extends and buffer is not None and buffer.size() == 0:
             warnings.warn(
                 f"{self.save_path} has no {REPLAY_BUFFER}, which --save-replay-buffer writes: training continues with an "
                 "empty replay buffer",

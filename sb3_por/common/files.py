@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and folders that can be written."""
+"""Atomic writes, and checks of output paths."""
 
 import os
 import re
@@ -13,11 +13,11 @@ from sb3_por.common.errors import UserError
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
-    A context whose body writes a temporary file beside ``path``; the file appears under its name when the body ends
-    without an error, so that a killed process leaves the old file or the new one, never half of one.
+    Replace a file atomically: the body writes a temporary file beside it, which is renamed when the body ends without an
+    error. A killed process leaves the old file or the new one.
 
-    :param path: the file to replace; its suffix is kept, since SB3, NumPy and Matplotlib go by it
-    :return: the temporary path to write to
+    :param path: File to replace; the temporary one keeps its suffix, on which SB3, NumPy and Matplotlib depend
+    :return: Temporary path to write to
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
@@ -31,7 +31,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def remove_unfinished(folder: str | os.PathLike[str]) -> None:
-    """Remove what a process that was killed inside ``atomic_write`` left at any depth of a folder where no other writes."""
+    """Remove temporary files of killed processes at any depth of a folder that no other process writes to."""
     for path in Path(folder).rglob(".*"):
         if path.is_file() and re.fullmatch(r"\..+\.[0-9a-f]{32}(\.\w+)?", path.name):
             path.unlink()
@@ -39,9 +39,9 @@ def remove_unfinished(folder: str | os.PathLike[str]) -> None:
 
 def check_writable(folder: str | os.PathLike[str]) -> None:
     """
-    Make a folder and try to write in it, before hours of work are to be stored there.
+    Make a folder and try to write in it.
 
-    :raises UserError: if that is not possible
+    :raises UserError: If that is not possible
     """
     probe = Path(folder) / f".{uuid.uuid4().hex}"
     try:

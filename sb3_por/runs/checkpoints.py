@@ -1,4 +1,4 @@
-"""Checkpoints from which a killed run goes on: model, replay buffer and random generators, whole or absent."""
+"""Checkpoints that a killed run is resumed from: model, replay buffer and random states, written atomically."""
 
 import hashlib
 import json
@@ -35,8 +35,8 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: float
     :param model: the model, between two rollouts
     :param run: the run's folder
     :param env_id: names the folder of ``VecNormalize`` statistics, as in the zoo
-    :param seconds: that the run has taken so far
-    :return: the new folder
+    :param seconds: Wall-clock time of the run so far
+    :return: The new folder
     """
     root = run / CHECKPOINTS
     final = root / f"step_{model.num_timesteps}"
@@ -78,21 +78,21 @@ def latest_checkpoint(run: Path) -> Path | None:
 
 
 def remove_checkpoints(run: Path) -> None:
-    """A finished run needs none."""
+    """Remove all checkpoints of a finished run."""
     for folder in (run / CHECKPOINTS).glob("step_*"):
         discard(folder)
     shutil.rmtree(run / CHECKPOINTS, ignore_errors=True)
 
 
 def discard(checkpoint: Path) -> None:
-    """Remove a checkpoint so that half of it is never taken for one."""
+    """Remove a checkpoint atomically."""
     hidden = checkpoint.with_name(f".{uuid.uuid4().hex}")
     checkpoint.rename(hidden)
     shutil.rmtree(hidden)
 
 
 def restore_monitors(run: Path, checkpoint: Path) -> None:
-    """Remove the episodes that ended after a checkpoint from the run's ``*.monitor.csv``: they will be played again."""
+    """Remove the episodes that ended after a checkpoint from the run's ``*.monitor.csv``; they are played again."""
     for name, size in json.loads((checkpoint / "monitors.json").read_text()).items():
         file = run / name
         if file.stat().st_size > size:
@@ -124,7 +124,7 @@ def read_rng_state(checkpoint: Path) -> dict[str, Any]:
 
 
 def read_seconds(checkpoint: Path) -> float:
-    """How long the run had taken at a checkpoint; 0 if it does not say."""
+    """Wall-clock time of the run at a checkpoint; 0 if it was not recorded."""
     file = checkpoint / "seconds.json"
     return float(json.loads(file.read_text())) if file.is_file() else 0.0
 

@@ -132,7 +132,7 @@ def the_run(folder: Path) -> Path:
 
 
 def is_finished(run: Path, env_id: str) -> bool:
-    """Whether a run has its last model and no checkpoint to go on from."""
+    """Whether a run has its last model and no checkpoint."""
     return (run / last_model(env_id)).exists() and not (run / CHECKPOINTS).exists()
 
 

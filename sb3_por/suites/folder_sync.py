@@ -1,4 +1,4 @@
-"""Copies a run's folder to another machine while the run goes on, so that the copy can be taken up at any moment."""
+"""Copies the folder of a running run to another machine, where the run can be resumed from it at any moment."""
 
 import uuid
 from pathlib import Path
@@ -49,7 +49,7 @@ def _stamps(folder: Path) -> Stamps:
 
 def write_changes(run: Run, changes: Changes) -> None:
     """
-    Bring a copy up to date. Whoever is killed in here leaves one that can be taken up.
+    Bring a copy up to date. A copy that is interrupted at any point can be resumed from.
 
     :param run: the run whose folder is the copy
     :param changes: from ``read_changes``
@@ -67,7 +67,7 @@ def write_changes(run: Run, changes: Changes) -> None:
     _write_all(run.folder, others)
     for step, files in of_steps.items():
         if None not in files.values():
-            # Whole or absent, and after the blocks that it refers to.
+            # Atomically, and after the blocks that it refers to.
             temporary = checkpoints / f".{uuid.uuid4().hex}"
             _write_all(temporary, files)
             temporary.rename(step)

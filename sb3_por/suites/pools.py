@@ -1,4 +1,4 @@
-"""Where the runs of a suite are done: processes of this machine. ``ray_pool.py`` has those of a cluster."""
+"""Pools that do the runs of a suite: processes of this machine here, a cluster in ``ray_pool.py``."""
 
 import ctypes
 import os
@@ -18,7 +18,7 @@ POLL_S = 0.5
 
 class Pool(ABC):
     """
-    Does what is left to do of some runs: finished ones are skipped, interrupted ones go on.
+    Does runs: finished ones are skipped, interrupted ones are resumed.
 
     :param runs: the runs
     """
@@ -32,7 +32,7 @@ class Pool(ABC):
         self._progress: dict[tuple[Run, str], tuple[int, float | None]] = {}
 
     def work(self) -> Generator[None, None, None]:
-        """Yields now and then, until all runs are done; a caller that stops listening interrupts them."""
+        """Do all runs. Yields after each look at them; closing the generator interrupts them."""
         todo = [run for run in self.runs if self.states[run] != "finished"]
         try:
             while todo or self._active():
@@ -75,7 +75,7 @@ class Pool(ABC):
 
     @abstractmethod
     def _stop(self) -> None:
-        """End what still runs, so that it can be taken up again."""
+        """Interrupt the active runs, so that they can be resumed."""
 
 
 class LocalPool(Pool):
@@ -107,7 +107,7 @@ class LocalPool(Pool):
                 self.states[run] = final_state(run, process.returncode)
 
     def _stop(self) -> None:
-        """Ask what still runs to save and stop."""
+        """Let the active runs save and stop."""
         for process in self._processes.values():
             process.terminate()
         for process in self._processes.values():
@@ -116,7 +116,7 @@ class LocalPool(Pool):
 
 def start_process(run: Run, threads: int) -> subprocess.Popen:
     """
-    Start a run or go on with it. It dies with the process that calls this, and writes to ``run.log``.
+    Start or resume a run. It dies with the process that calls this, and writes to ``run.log``.
 
     :param threads: threads of its numerical libraries
     """

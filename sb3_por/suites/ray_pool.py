@@ -30,7 +30,7 @@ RETRIES = 3
 
 class RayPool(Pool):
     """
-    Runs that are tasks of a Ray cluster. A run whose worker or machine is lost goes on elsewhere, from the last checkpoint
+    Runs that are tasks of a Ray cluster. A run whose worker or machine is lost is resumed elsewhere, from the last checkpoint
     that was received.
 
     :param runs: the runs
@@ -91,7 +91,7 @@ class RayPool(Pool):
             self.states[run] = final_state(run, returncode)
 
     def _lost(self, run: Run, error: RayError) -> None:
-        """Try again, but not for ever: what ends a worker may be the run itself, by its need of memory."""
+        """Retry a limited number of times: the run itself may end its worker, by its need of memory."""
         del self._tasks[run]
         self._losses[run] = self._losses.get(run, 0) + 1
         if self._losses[run] > RETRIES:

@@ -63,7 +63,7 @@ def _do(pool: Pool, folder: Path) -> int:
     try:
         _show_work(pool, console)
     except KeyboardInterrupt as interrupt:
-        raise KeyboardInterrupt("interrupted; the same command goes on") from interrupt
+        raise KeyboardInterrupt("interrupted; the same command resumes it") from interrupt
     finally:
         signal.signal(signal.SIGTERM, handler)
     console.print(progress_table(pool))

@@ -1,4 +1,4 @@
-"""What a suite file says: which runs there are, and the command of each of them."""
+"""Suite files: the runs that one describes, and the command of each."""
 
 import sys
 from dataclasses import dataclass, field, fields
@@ -88,7 +88,7 @@ class Run:
         return "interrupted" if run_arguments(self.run_folder) else "new"
 
     def command(self) -> list[str]:
-        """What starts the run or goes on with it."""
+        """The command that starts or resumes the run."""
         train = [sys.executable, "-m", "sb3_por.zoo"]
         if self.state() == "interrupted":
             return [*train, "--resume", str(self.run_folder)]

@@ -59,7 +59,7 @@ class Settings(StoreDict):
 
 
 class Parser(argparse.ArgumentParser):
-    """The zoo's parser with our defaults; what cannot work is said before anything is made."""
+    """The zoo's parser with our defaults; it refuses what cannot work before it makes a folder."""
 
     def __init__(self) -> None:
         super().__init__(

@@ -1,4 +1,4 @@
-"""What happens now and then during training: evaluation on held-out episodes, and checkpoints."""
+"""Callbacks of a run: evaluation on held-out episodes, and checkpoints."""
 
 import time
 from pathlib import Path
@@ -26,9 +26,9 @@ def is_due(callback: BaseCallback, interval: int) -> bool:
 
 class Stopwatch:
     """
-    How long a run has been at work, resumes and all, but not what a killed one did after its last checkpoint.
+    Wall-clock time of a run, with the time before its last checkpoint if it was resumed.
 
-    :param before: seconds until the checkpoint that it goes on from
+    :param before: Seconds before the checkpoint
     """
 
     def __init__(self, before: float = 0.0) -> None:
@@ -45,16 +45,16 @@ class EvaluationCallback(EvalCallback):
     Plays the same held-out episodes at regular intervals and at the end of training.
 
     Writes ``evaluations.npz`` in SB3's format (``timesteps``, ``results``, ``ep_lengths``, ``successes``) with
-    ``normalized_performance``, of the same shape as ``results``, and ``wall_clock_s`` (that the run took so far); keeps the
+    ``normalized_performance``, of the same shape as ``results``, and ``wall_clock_s``, the seconds so far; keeps the
     model with the best mean normalized performance as ``best_model.zip``; logs ``eval/*``.
 
-    :param eval_env: as :func:`sb3_por.evaluation.evaluate.run_episodes` takes it
-    :param episodes: what to play
-    :param eval_freq: interval in environment steps
-    :param run: the run's folder
-    :param stopwatch: of the run
-    :param callback_on_new_best: called when there is a new best model
-    :param verbose: 1: a line an evaluation
+    :param eval_env: Environments, as :func:`sb3_por.evaluation.episodes.run_episodes` takes them
+    :param episodes: Episodes to play
+    :param eval_freq: Interval in environment steps
+    :param run: Folder of the run
+    :param stopwatch: Stopwatch of the run
+    :param callback_on_new_best: Called when there is a new best model
+    :param verbose: 1 to print a line for each evaluation
     """
 
     def __init__(
@@ -89,10 +89,10 @@ class EvaluationCallback(EvalCallback):
     def _on_training_start(self) -> None:
         file = self.run / EVALUATIONS
         if self.num_timesteps > 0 and file.is_file():
-            self._take_up(file)
+            self._keep_earlier(file)
 
-    def _take_up(self, file: Path) -> None:
-        """A resumed run keeps the evaluations up to the step that it goes on from."""
+    def _keep_earlier(self, file: Path) -> None:
+        """Keep the evaluations up to the step at which a run is resumed."""
         with np.load(file) as arrays:
             kept = arrays["timesteps"] <= self.num_timesteps
             self._history = {name: list(arrays[name][kept]) for name in arrays.files}
@@ -155,9 +155,9 @@ class EvaluationCallback(EvalCallback):
 
 class SaveBestStatistics(BaseCallback):
     """
-    Keeps the ``VecNormalize`` statistics that the best model was evaluated with; those at the end are others.
+    Saves the ``VecNormalize`` statistics of each new best model; those at the end of training differ.
 
-    :param path: of the file
+    :param path: File to write
     """
 
     def __init__(self, path: Path) -> None:
@@ -174,17 +174,17 @@ class SaveBestStatistics(BaseCallback):
 
 class CheckpointCallback(BaseCallback):
     """
-    At regular intervals, saves the model as ``rl_model_<steps>_steps.zip`` and all that a killed run needs to go on.
+    Saves the model as ``rl_model_<steps>_steps.zip``, and a checkpoint from which a killed run is resumed.
 
-    Between two rollouts, when every transition is stored and every update is done; there it also ends the training that
-    a signal asked to stop.
+    It saves between two rollouts, when every transition is stored and every update is done. There it also ends training
+    after a signal.
 
-    :param save_freq: interval in environment steps; with 0 only when training is stopped
-    :param run: the run's folder
-    :param env_id: the environment
-    :param stopwatch: of the run
-    :param rng_state: states of the random generators to begin with
-    :param at_start: save a checkpoint first: a finished run that is extended is an interrupted one from then on
+    :param save_freq: Interval in environment steps; 0 to save only after a signal
+    :param run: Folder of the run
+    :param env_id: Gymnasium id
+    :param stopwatch: Stopwatch of the run
+    :param rng_state: States of the random generators to begin with
+    :param at_start: Also save a checkpoint before the first step, which makes a finished run an interrupted one
     """
 
     def __init__(

@@ -56,8 +56,8 @@ from sb3_por.training.trials import trial_settings
 
 def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
     """
-    :param policy: what the settings name
-    :raises UserError: if the policy cannot read the observations
+    :param policy: Policy that the settings name
+    :raises UserError: If the policy cannot read the observations
     """
     needed = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "CnnPolicy" if is_image_space(space) else "MlpPolicy"
     # MlpPolicy flattens images, which works, however badly.
@@ -74,7 +74,7 @@ def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
 
 
 class Experiment(ExperimentManager):
-    """The zoo's manager of one run. Each method here mends one of its faults and says which."""
+    """The zoo's manager of one run. The docstring of each method names the zoo's behaviour that it changes."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -114,7 +114,7 @@ class Experiment(ExperimentManager):
         return hyperparams, saved
 
     def create_log_folder(self) -> None:
-        """The zoo looks for a free number and makes the folder later: runs started together would share it."""
+        """Make the folder at once; the zoo makes it later, so that runs started together would share it."""
         while self._resumed_run is None:
             run_id = get_latest_run_id(self.log_path, self.env_name) + 1
             self.save_path = os.path.join(self.log_path, f"{self.env_name}_{run_id}{self._uuid}")
@@ -216,12 +216,13 @@ class Experiment(ExperimentManager):
         return read_seconds(self._checkpoint) if self._checkpoint else 0.0
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
-        """From a checkpoint, the replay buffer, too; and scenes that were not drawn at the beginning of the run."""
+        """Restore the replay buffer of a checkpoint, too, and draw other scenes than at the beginning of the run."""
         with quiet_n_steps():
             model = super()._load_pretrained_agent(hyperparams, env)
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
-        if self._extends and getattr(model, "replay_buffer", None) is not None and model.replay_buffer.size() == 0:
+        buffer = getattr(model, "replay_buffer", None)
+        if self._extends and buffer is not None and buffer.size() == 0:
             warnings.warn(
                 f"{self.save_path} has no {REPLAY_BUFFER}, which --save-replay-buffer writes: training continues with an "
                 "empty replay buffer",
@@ -232,7 +233,7 @@ class Experiment(ExperimentManager):
         return model
 
     def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> dict[str, Any]:
-        """The zoo's last step before it builds the model: see that the policy fits the observations."""
+        """Check that the policy fits the observations; the zoo builds the model next."""
         check_policy(hyperparams.get("policy"), env.observation_space, self.env_name.gym_id)
         return super()._preprocess_action_noise(hyperparams, saved, env)
 
@@ -246,8 +247,8 @@ class Experiment(ExperimentManager):
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
-        A resumed run goes on counting: the zoo's would repeat its schedules and its random warm-up. Ctrl-C and SIGTERM end
-        it at the next safe place.
+        Continue the step count of a resumed run; the zoo's would repeat its schedules and its random warm-up. Ctrl-C and
+        SIGTERM end training at the next safe place.
         """
         kwargs: dict[str, Any] = {"callback": self.callbacks, "reset_num_timesteps": not self.continue_training}
         if self.log_interval != -1:
@@ -288,11 +289,11 @@ class Experiment(ExperimentManager):
             model.env.close()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
-        """Files are whole or absent."""
-        go_on = f"interrupted at step {model.num_timesteps}; go on with: python train.py --resume {self.save_path}"
+        """Write files atomically, and say how an interrupted run is resumed."""
+        message = f"interrupted at step {model.num_timesteps}; resume with: python train.py --resume {self.save_path}"
         if self._interrupted and latest_checkpoint(Path(self.save_path)) is None:
             # A model without a checkpoint is what marks a finished run.
-            raise KeyboardInterrupt(go_on)
+            raise KeyboardInterrupt(message)
         save: Callable[[Path], Any] = model.save
         with atomic_write(Path(self.save_path) / last_model(str(self.env_name))) as path:
             save(path)
@@ -304,5 +305,5 @@ class Experiment(ExperimentManager):
             statistics.save(os.path.join(self.params_path, STATISTICS))
         print(f"Saved to {self.save_path}")
         if self._interrupted:
-            raise KeyboardInterrupt(go_on)
+            raise KeyboardInterrupt(message)
         remove_checkpoints(Path(self.save_path))

@@ -1,4 +1,4 @@
-"""What ``train.py -optimize`` tries: the settings that all visual algorithms share, and those of each objective."""
+"""Search spaces of ``train.py -optimize``: shared settings of the visual algorithms, and those of each objective."""
 
 from collections.abc import Callable
 from typing import Any

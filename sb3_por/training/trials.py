@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import optuna
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 
 from sb3_por.common.errors import UserError, one_line
@@ -47,4 +49,4 @@ def _open(storage: str) -> Any:
     """As the zoo does."""
     if not storage.endswith(".log"):
         return storage
-    return optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(storage))
+    return JournalStorage(JournalFileBackend(storage))

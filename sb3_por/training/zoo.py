@@ -1,5 +1,5 @@
 """
-The RL Zoo's ``train`` command with our algorithms and tasks, and with its known faults mended.
+The RL Zoo's ``train`` command with our algorithms, tasks, evaluation and checkpoints.
 
 Importing this module imports ``rl_zoo3``, which replaces Gymnasium's ``TimeLimit``: nothing else in the package does.
 """
@@ -26,9 +26,9 @@ for _name, _class in ALGORITHMS.items():
 
 def main(arguments: list[str] | None = None) -> int:
     """
-    Train as the command line says.
+    Train with the arguments of a command line.
 
-    :param arguments: of the command, ``sys.argv[1:]`` if ``None``
+    :param arguments: Arguments of the command; ``sys.argv[1:]`` by default
     :return: the exit code
     """
     if arguments is not None:

@@ -232,7 +232,7 @@ def test_a_suite_outlives_a_worker_and_a_node_of_its_cluster(tmp_path, cluster, 
     stopped = start([*command, "--root", tmp_path / "stopped"])
     wait_for(lambda: training_below(head), 240)
     stopped.terminate()
-    assert "interrupted; the same command goes on" in stopped.communicate()[1] and stopped.returncode == 130
+    assert "interrupted; the same command resumes it" in stopped.communicate()[1] and stopped.returncode == 130
     wait_for(lambda: training_below(head) is None and training_below(other) is None, 20)
 
     suite = start(command)

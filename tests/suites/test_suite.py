@@ -257,7 +257,7 @@ def test_an_asked_for_stop_leaves_runs_that_go_on(start_suite, tmp_path, capfd):
     workers = psutil.Process(process.pid).children()
     os.kill(process.pid, signal.SIGTERM)
     process.join()
-    assert process.exitcode == 130 and "interrupted; the same command goes on" in capfd.readouterr().err
+    assert process.exitcode == 130 and "interrupted; the same command resumes it" in capfd.readouterr().err
     wait_for(lambda: all(map(has_ended, workers)), 10)
     process = start_suite(FAKE_SUITE)
     process.join()

@@ -1,4 +1,4 @@
-"""A run that is killed goes on from its last checkpoint and ends as if it had not been."""
+"""A killed run is resumed from its last checkpoint and ends like an uninterrupted one."""
 
 import math
 import os

@@ -187,7 +187,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
     assert main([*PENDULUM, "-n", "160", "--eval-freq", "80", "-f", str(tmp_path), *SMALL]) == 130
     run = tmp_path / "sac" / "Pendulum-v1_1"
     last_line = capsys.readouterr().err.splitlines()[-1]
-    assert last_line == f"train.py: interrupted at step 130; go on with: python train.py --resume {run}"
+    assert last_line == f"train.py: interrupted at step 130; resume with: python train.py --resume {run}"
     assert load_model(run / "Pendulum-v1.zip").num_timesteps == 130
     monkeypatch.undo()
     assert main(["--resume", str(run)]) == 0
@@ -321,3 +321,12 @@ def test_tracking_without_its_package_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main([*PENDULUM, "--track"]) == 2
     assert capsys.readouterr().err.strip() == "train.py: error: --track needs Weights & Biases: pip install wandb"
+
+
+def test_a_model_of_another_method_is_refused_in_one_line(tmp_path, capsys):
+    ALGORITHMS["sac_por"]("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "por.zip")
+    flags = ["--algo", "sac_drq", "--env", "Pendulum-v1", "-n", "10", "-i", str(tmp_path / "por.zip"), "-f", str(tmp_path)]
+    assert main([*flags, "-params", "policy:MlpPolicy"]) == 2
+    shown = capsys.readouterr().err.splitlines()[-1]
+    assert "SACDrQ has no objective" in shown and "PartialOrder" in shown and "load_encoder()" in shown
+    assert not list(tmp_path.glob("*/Pendulum-v1_*"))

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_por.common.errors import UserError, check_known, one_line
-from softbody_envs.experts import EXPERT_IDS, make_expert
+from softbody_envs.experts import EXPERT_IDS, has_expert, make_expert
 from softbody_envs.registration import task_class
 
 
@@ -56,7 +56,8 @@ class ExpertModel:
     """
 
     def __init__(self, env_id: str) -> None:
-        check_known("environment with an expert", env_id, EXPERT_IDS)
+        if not has_expert(env_id):
+            check_known("environment with an expert", env_id, EXPERT_IDS)
         self.observation_space, self.action_space = _spaces(env_id)
         self._make_expert = lambda: make_expert(env_id)
         self._experts: list[Any] = []

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,7 @@ class Parser(argparse.ArgumentParser):
         if args.conf_file.endswith((".yml", ".yaml")):
             _check_hyperparameters(Path(args.conf_file), args.env)
         check_writable(args.log_folder)
+        _choose_threads(args)
         args.commit = current_commit()
         args.machine = current_machine()
         return args
@@ -124,6 +126,7 @@ class Parser(argparse.ArgumentParser):
                 raise SystemExit(0)
         import_packages(args.gym_packages)
         check_writable(run)
+        _choose_threads(args)
         return args
 
 
@@ -143,6 +146,14 @@ def hyperparameter_file(algo: str, env_id: str) -> Path:
             if key in settings:
                 return file
     raise UserError(f"there are no settings of {algo} for {env_id}; write some and pass -conf FILE.yml")
+
+
+def _choose_threads(args: argparse.Namespace) -> None:
+    """One thread, unless the user has chosen another number; worker processes keep to it, too."""
+    if args.num_threads < 1 and "OMP_NUM_THREADS" not in os.environ:
+        args.num_threads = 1
+    if args.num_threads > 0:
+        os.environ["OMP_NUM_THREADS"] = str(args.num_threads)
 
 
 def _check_hyperparameters(file: Path, env_id: str) -> None:

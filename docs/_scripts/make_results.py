@@ -244,6 +244,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "longer": lambda: courses("long"),
     "steady": lambda: courses("steady"),
     "trials": lambda: evaluations("trials"),
+    "progress": lambda: evaluations("progress"),
     "rope": lambda: evaluations("rope"),
     "fold": lambda: evaluations("fold"),
     "fold_comparison": lambda: comparison("fold"),

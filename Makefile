@@ -7,9 +7,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-# The first interpreter that runs and that pybullet has wheels for; PYTHON=... names another.
-SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 11))
-PYTHON ?= $(shell for p in python3.11 python3.10 python3 python; do \
+# The first interpreter that pybullet or its fork has wheels for; PYTHON=... names another. The original draws faster.
+SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))
+PYTHON ?= $(shell for p in python3.11 python3.10 python3.13 python3.12 python3 python; do \
 	$$p -c '$(SUPPORTED)' >/dev/null 2>&1 && { echo $$p; break; }; done)
 
 export MPLBACKEND := Agg
@@ -55,6 +55,9 @@ $(VENV)/.installed-%: setup.cfg constraints.txt | $(BIN)/pip
 	@touch $@
 
 $(BIN)/pip:
-	@$(if $(PYTHON),$(PYTHON),false) -c '$(SUPPORTED)' || { echo "make: Python 3.10 or 3.11 is needed (pybullet has" \
-		"wheels for no other): install one, or name it: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@$(if $(PYTHON),$(PYTHON),false) -c '$(SUPPORTED)' || { printf '%s\n' \
+		"make: $(or $(PYTHON),what was found) is not Python 3.10 to 3.13, and pybullet has wheels for no other. Type" \
+		"    uv python install 3.13" \
+		"    make $(MAKECMDGOALS) PYTHON=\"\$$(uv python find 3.13)\"" \
+		"or name one that you have: make $(MAKECMDGOALS) PYTHON=/path/to/python3.13" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)

@@ -7,7 +7,9 @@ import re
 import shutil
 import subprocess
 import sys
-import zipfile
+import sysconfig
+import tarfile
+import venv
 from pathlib import Path
 
 import pytest
@@ -77,9 +79,20 @@ def test_constraints_pin_what_is_declared_within_its_range(options):
         assert pin.operator == "==" and requirement.specifier.contains(pin.version), name
 
 
-def test_a_wheel_holds_the_hyperparameters_and_the_page_and_finds_them(tmp_path, options):
-    """Installed without -e, away from the checkout."""
-    source = tmp_path / "source"
+@pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13"])
+@pytest.mark.parametrize("system, machine", [("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")])
+def test_one_pybullet_is_chosen_everywhere(options, system, machine, version):
+    declared = requirements(options["options"]["install_requires"])
+    environment = {"sys_platform": system, "platform_machine": machine, "python_version": version}
+    chosen = {name for name in ("pybullet", "pybullet-arm64") if declared[name].marker.evaluate(environment)}
+    original = (system, machine) == ("linux", "x86_64") and version in ("3.10", "3.11")
+    assert chosen == {"pybullet" if original else "pybullet-arm64"}
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory):
+    """The source distribution of the files that git knows or would add."""
+    source = tmp_path_factory.mktemp("source")
     files = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True
     ).stdout.split("\0")
@@ -87,36 +100,68 @@ def test_a_wheel_holds_the_hyperparameters_and_the_page_and_finds_them(tmp_path,
         if (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(ROOT / name, source / name)
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", tmp_path, source]
-    subprocess.run(command, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("sb3_por-*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(tmp_path / "installed")
-    installed = {path.name for path in (tmp_path / "installed" / "sb3_por" / "zoo_hyperparams").glob("*.yml")}
-    assert installed == {path.name for path in (ROOT / "zoo_hyperparams").glob("*.yml")}
-    assert (tmp_path / "installed" / "sb3_por" / "analysis" / "report.html.jinja").is_file()
-    assert all((tmp_path / "installed" / package / "py.typed").is_file() for package in PACKAGES)
+    script = "from setuptools.build_meta import build_sdist; build_sdist('dist')"
+    subprocess.run([sys.executable, "-c", script], cwd=source, check=True, capture_output=True)
+    (archive,) = (source / "dist").glob("sb3_por-*.tar.gz")
+    return archive
+
+
+@pytest.fixture(scope="module")
+def installed(sdist, tmp_path_factory):
+    """An environment that holds the wheel of the source distribution alone, away from the checkout."""
+    folder = tmp_path_factory.mktemp("installed")
+    pip = [sys.executable, "-m", "pip"]
+    wheel = [*pip, "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", folder, sdist]
+    subprocess.run(wheel, check=True, capture_output=True)
+    venv.create(folder / "venv", symlinks=True)
+    (built,) = folder.glob("sb3_por-*.whl")
+    install = [*pip, "--python", folder / "venv/bin/python", "install", "-q", "--no-deps", "--no-index", built]
+    subprocess.run(install, check=True, capture_output=True)
+    return folder / "venv"
+
+
+def run_installed(installed, *command):
+    """Run a command of the environment; what the packages depend on comes from this one."""
+    environment = os.environ | {"PYTHONPATH": sysconfig.get_path("purelib")}
+    command = [installed / "bin" / command[0], *command[1:]]
+    return subprocess.run(command, cwd=installed, env=environment, capture_output=True, text=True)
+
+
+def test_a_source_distribution_holds_the_suites_and_the_constraints(sdist):
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"constraints.txt", *(f"suites/{path.name}" for path in (ROOT / "suites").glob("*.yml"))} <= names
+
+
+def test_an_installed_package_holds_its_data_and_finds_it(installed):
+    (package,) = installed.glob("lib/python*/site-packages/sb3_por")
+    names = {path.name for path in (package / "zoo_hyperparams").glob("*.yml")}
+    assert names == {path.name for path in (ROOT / "zoo_hyperparams").glob("*.yml")}
+    assert (package / "analysis" / "report.html.jinja").is_file()
+    assert all((package.parent / name / "py.typed").is_file() for name in PACKAGES)
     script = "from sb3_por.training.arguments import hyperparameter_file as f; print(f('sac_por', 'PourWater-v0'))"
-    shown = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "installed")},
-        capture_output=True,
-        text=True,
-    )
-    assert shown.stdout.strip() == str(tmp_path / "installed/sb3_por/zoo_hyperparams/sac_por.yml"), shown.stderr
+    shown = run_installed(installed, "python", "-c", script)
+    assert shown.stdout.strip() == str(package / "zoo_hyperparams" / "sac_por.yml"), shown.stderr
 
 
-def test_make_refuses_an_interpreter_without_pybullet_wheels(tmp_path):
-    python = tmp_path / "python3.12"
+@pytest.mark.parametrize("script", ["sb3-por", "sb3-por-train"])
+def test_an_installed_package_has_its_commands(installed, script):
+    shown = run_installed(installed, script, "--help")
+    assert shown.returncode == 0 and shown.stdout.startswith("usage: "), shown.stderr
+
+
+def test_make_refuses_an_unsupported_interpreter_and_says_what_to_type(tmp_path):
+    python = tmp_path / "python3.14"
     python.write_text("#!/bin/sh\nexit 1\n")  # what the Makefile's check of a version answers
     python.chmod(0o755)
-    for interpreter in (str(python), ""):
+    for interpreter, named in ((str(python), str(python)), ("", "what was found")):
         done = subprocess.run(
             ["make", "train", f"VENV={tmp_path}/venv", f"PYTHON={interpreter}"], cwd=ROOT, capture_output=True, text=True
         )
         assert done.returncode == 2
-        assert "make: Python 3.10 or 3.11 is needed (pybullet has wheels for no other)" in done.stderr
+        assert f"make: {named} is not Python 3.10 to 3.13" in done.stderr
+        assert "uv python install 3.13\n" in done.stderr
+        assert 'make train PYTHON="$(uv python find 3.13)"\n' in done.stderr
         assert not (tmp_path / "venv").exists()
 
 

@@ -117,7 +117,7 @@ def fit(
 
 
 def in_parts(network: Callable[[th.Tensor], th.Tensor], images: th.Tensor) -> th.Tensor:
-    """What a network says of images, without gradient."""
+    """A network's output for images, without gradient."""
     with th.no_grad():
         return th.cat([network(part) for part in images.split(500)])
 

@@ -62,7 +62,7 @@ class Record(BaseCallback):
     def _on_step(self) -> bool:
         updates = self.model._n_updates
         if updates > 0:
-            # The control is measured now and then; its last value stands until the next.
+            # The control is measured every few updates; its last value stands until the next.
             self._since.append([self.logger.name_to_value.get(f"train/{name}", np.nan) for name in METRICS])
             if updates % INTERVAL == 0:
                 self.rows.append((updates, *np.nanmean(self._since, axis=0).tolist()))

@@ -297,7 +297,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def main(arguments: list[str] | None = None) -> int:
     """
-    :param arguments: of the command, ``sys.argv[1:]`` if ``None``
+    :param arguments: Arguments of the command; ``sys.argv[1:]`` by default
     :return: the exit code
     """
 

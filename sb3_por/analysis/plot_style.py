@@ -16,7 +16,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from sb3_por.common.files import atomic_write, check_output
 
 #: Colours of the algorithms that the documentation compares. A look depends on the name alone, so that an algorithm looks
-#: the same in every figure, whoever stands beside it. These are Okabe and Ito's colours, which readers with any colour
+#: the same in every figure, independent of the others. These are Okabe and Ito's colours, which readers with any colour
 #: vision can tell apart (brown stands for their yellow, which is faint on white).
 COLORS = {
     "sac_por": "#0072B2",

@@ -20,7 +20,7 @@ EVAL_SEED = 0
 
 
 class Model(Protocol):
-    """What can be evaluated: every SB3 model, and anything else with a space and a ``predict`` like theirs."""
+    """Interface of a policy that can be evaluated: every SB3 model, and others with its spaces and its ``predict``."""
 
     observation_space: spaces.Space
     action_space: spaces.Space
@@ -160,7 +160,7 @@ def run_episodes(model: Model, env: VecEnv, episodes: list[Episode]) -> Evaluati
 
     :param model: an SB3 model
     :param env: environments, each inside ``Monitor`` and ``FixedEpisodes``, wrapped as the model's training environment
-    :param episodes: what to play, shared out among the environments
+    :param episodes: Episodes to play, divided among the environments
     :raises UserError: if the model's training has diverged
     """
     if has_diverged(model):

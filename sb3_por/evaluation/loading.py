@@ -191,7 +191,7 @@ def find_environment(env_id: str, model: str | Path | None = None) -> str:
     Import what registers an environment: the package in its name (``"package:Name-v0"``), and those that a run was given.
 
     :param env_id: a Gymnasium id, perhaps with a package
-    :param model: as :func:`load_model` takes it
+    :param model: Model file or run folder, see :func:`load_model`
     :return: the id without the package
     :raises UserError: if there is no such environment
     """

@@ -1,4 +1,4 @@
-"""What a run's training environment is made of, as its settings name it, and how to import that."""
+"""Parts of a run's training environment, as its settings name them, and their import."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields

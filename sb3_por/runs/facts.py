@@ -33,12 +33,12 @@ class RunFacts:
     :param env: environment id
     :param algo: name of the algorithm, or the run's label
     :param seed: seed
-    :param folder: where its files are
+    :param folder: Folder of its files
     :param state: ``"finished"``, ``"running"`` or ``"stopped"``
     :param steps: done so far
     :param planned: to be done; ``None`` if that is not recorded
-    :param commit: that it was started from; empty if not recorded
-    :param machine: that it was started on; empty if not recorded
+    :param commit: Commit at its start; empty if not recorded
+    :param machine: Machine at its start; empty if not recorded
     :param settings: hyperparameters and arguments
     :param log: last lines of what it printed; empty if that was not kept
     """
@@ -73,7 +73,7 @@ def take_inventory(folders: Iterable[str | Path]) -> list[RunFacts]:
 
 def orphaned_logs(folders: Iterable[str | Path]) -> dict[Path, list[str]]:
     """
-    :param folders: as above
+    :param folders: Run folders, or folders that hold some at any depth
     :return: log -> its last lines, of what failed before it had a run's folder
     """
     logs = sorted(log for folder in folders for log in Path(folder).rglob(LOG))
@@ -136,7 +136,7 @@ def progress(run: Path) -> tuple[int, float | None]:
 
 
 def run_identity(run: Path) -> dict[str, Any]:
-    """What ``RUN_KEYS`` are for a run: from its settings, else from its path."""
+    """Values of ``RUN_KEYS`` for a run: from its settings, else from its path."""
     arguments = run_arguments(run)
     name, _, number = run.name.rpartition("_")
     return {

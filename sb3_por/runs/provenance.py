@@ -25,7 +25,7 @@ def current_commit() -> str:
 
 
 def current_machine() -> str:
-    """What this process runs on, in a line: processor, accelerator, memory, versions."""
+    """One line about the machine of this process: processor, accelerator, memory, versions."""
     info = Path("/proc/cpuinfo")
     models = re.findall(r"model name\s*:\s*(.+)", info.read_text()) if info.is_file() else []
     parts = [

@@ -17,7 +17,7 @@ Stamps = dict[str, tuple[int, int]]
 def read_changes(run: Run, known: Stamps) -> Changes:
     """
     :param run: a run, perhaps at work
-    :param known: what the copy has; brought up to date
+    :param known: Stamps of the files in the copy; updated
     :return: what the copy lacks; if that has a checkpoint, all of it
     """
     while True:

@@ -36,7 +36,7 @@ class RayPool(Pool):
     :param runs: the runs
     :param cpus: CPUs of a run, and threads of its process
     :param gpus: GPUs of a run, parts of one allowed
-    :param address: of the cluster, as ``ray.init`` takes it: ``"auto"``, or ``"<host>:<port>"``
+    :param address: Address of the cluster, as ``ray.init`` takes it: ``"auto"``, or ``"<host>:<port>"``
     :raises UserError: if there is no such cluster, or none of its machines has room for a run
     """
 
@@ -120,7 +120,7 @@ def _do_run(run: Run, threads: int, files: Changes) -> Iterator[tuple[Changes, i
     """
     On a machine of the cluster: do a run in a folder of its own, and tell of every change there.
 
-    :param files: what the run's folder has to begin with
+    :param files: Files of the run's folder at the start
     :return: changes since the last message, and with the last one the return code of the run's process
     """
     with tempfile.TemporaryDirectory(prefix="sb3_por_") as folder:

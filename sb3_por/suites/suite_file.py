@@ -57,7 +57,7 @@ class Run:
     One run of a suite.
 
     :param folder: ``<root>/<env>/<algo or variant>/seed_<seed>``; the zoo's layout begins in it
-    :param flags: of train.py, besides algorithm, environment, seed, folder and label
+    :param flags: Flags of train.py besides algorithm, environment, seed, folder and label
     :param variant: name of the suite's variant; empty for the algorithm itself
     """
 
@@ -74,7 +74,7 @@ class Run:
 
     @property
     def run_folder(self) -> Path:
-        """Where train.py writes."""
+        """Folder to which train.py writes."""
         return self.folder / self.algo / f"{self.env}_1"
 
     @property

@@ -78,7 +78,7 @@ class Parser(argparse.ArgumentParser):
             del options["choices"]  # checked below, with the nearest name
         return super().add_argument(*names, **options)
 
-    def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]
+    def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]  # as the zoo calls it
         self.set_defaults(**DEFAULTS, progress=sys.stderr.isatty())
         self.add_argument(
             "--resume",

@@ -139,7 +139,7 @@ class EvaluationCallback(EvalCallback):
         for name, value in row.items():
             self._history.setdefault(name, []).append(value)
         with atomic_write(self.run / EVALUATIONS) as path:
-            np.savez(path, **{name: np.array(values) for name, values in self._history.items()})  # type: ignore[arg-type]
+            np.savez(path, **{name: np.array(values) for name, values in self._history.items()})  # type: ignore[arg-type]  # numpy's stubs
 
         self.logger.record("eval/mean_reward", float(np.mean(evaluation.returns)))
         self.logger.record("eval/mean_ep_length", float(np.mean(evaluation.lengths)))

@@ -21,7 +21,7 @@ from sb3_por.training.search_spaces import sampler
 for _name, _class in ALGORITHMS.items():
     ALGOS[_name] = _class
     # A trial's parameters are the algorithm's arguments.
-    HYPERPARAMS_SAMPLER[_name], HYPERPARAMS_CONVERTER[_name] = sampler(_name), dict  # type: ignore[assignment]
+    HYPERPARAMS_SAMPLER[_name], HYPERPARAMS_CONVERTER[_name] = sampler(_name), dict  # type: ignore[assignment]  # a dict
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -34,9 +34,9 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments is not None:
         sys.argv = ["train.py", *arguments]
     # The zoo's train() has no hooks: it finds these three by name in its module.
-    rl_zoo3.train.argparse = types.SimpleNamespace(ArgumentParser=Parser)  # type: ignore[assignment]
-    rl_zoo3.train.StoreDict = Settings  # type: ignore[misc]
-    rl_zoo3.train.ExperimentManager = Experiment  # type: ignore[misc]
+    rl_zoo3.train.argparse = types.SimpleNamespace(ArgumentParser=Parser)  # type: ignore[assignment]  # a patch
+    rl_zoo3.train.StoreDict = Settings  # type: ignore[misc]  # a patch
+    rl_zoo3.train.ExperimentManager = Experiment  # type: ignore[misc]  # a patch
     return exit_code(rl_zoo3.train.train, "train.py")
 
 

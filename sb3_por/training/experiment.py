@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 from filelock import FileLock, Timeout
 from gymnasium import spaces
+from gymnasium.spaces.utils import flatdim
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -59,6 +60,11 @@ def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
     :param policy: Policy that the settings name
     :raises UserError: If the policy cannot read the observations
     """
+    if policy == "CnnPolicy" and isinstance(space, spaces.Box) and len(space.shape) == 3 and space.low.min() < 0:
+        raise UserError(
+            f"normalize:True would normalize the images of {env_id}, which CnnPolicy scales itself; pass -params "
+            "\"normalize:{'norm_obs':False,'norm_reward':True}\" to normalize rewards alone"
+        )
     needed = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "CnnPolicy" if is_image_space(space) else "MlpPolicy"
     # MlpPolicy flattens images, which works, however badly.
     fits = policy == needed or (policy == "MlpPolicy" and needed == "CnnPolicy")
@@ -67,7 +73,7 @@ def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
         raise UserError(f"{policy} cannot read the observations of {env_id}, {space}; pass -params policy:{needed}{alone}")
     if policy != needed and policy == "MlpPolicy":
         print(
-            f"note: MlpPolicy flattens the images of {env_id} into {np.prod(space.shape)} numbers; you may want "  # type: ignore[arg-type]
+            f"note: MlpPolicy flattens the images of {env_id} into {flatdim(space)} numbers; you may want "
             "-params policy:CnnPolicy, or --env-kwargs obs_type:state where the environment has it",
             file=sys.stderr,
         )

@@ -330,3 +330,9 @@ def test_a_model_of_another_method_is_refused_in_one_line(tmp_path, capsys):
     shown = capsys.readouterr().err.splitlines()[-1]
     assert "SACDrQ has no objective" in shown and "PartialOrder" in shown and "load_encoder()" in shown
     assert not list(tmp_path.glob("*/Pendulum-v1_*"))
+
+
+def test_normalized_images_are_refused_with_what_to_pass_instead(tmp_path, capsys):
+    words = ["--algo", "sac_por", "--env", "FallingBall-v0", "-n", "1", "-f", str(tmp_path), "--env-kwargs", "image_size:36"]
+    assert main([*words, "-params", "normalize:True"]) == 2
+    assert "normalize:{'norm_obs':False,'norm_reward':True}" in capsys.readouterr().err

@@ -69,7 +69,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         EzPickle.__init__(self, obs_type, image_size, split, renderer, render_mode, render_size)
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be one of {', '.join(OBS_TYPES)}, got {obs_type!r}")
-        if split not in SPLITS:
+        if split not in tuple(SPLITS):  # a list, too, can be refused by name
             raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")

@@ -11,6 +11,9 @@ The data are enough when more rounds do not help. The expert's own score in the 
 The mean of two actions can be neither of them, so the network predicts a distribution over ``N_BINS`` values of each
 element of an action, and plays the most likely one. It also predicts the state, which speeds up learning; `blind` lists
 the elements of the state that are predicted worst from held-out images.
+
+No ceiling of the rope can be trusted yet: its two ends look alike, so which of them the state calls the first cannot be
+seen, and the loss of the predicted state asks for it.
 """
 
 import argparse

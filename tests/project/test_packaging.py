@@ -116,7 +116,9 @@ def installed(sdist, tmp_path_factory):
     venv.create(folder / "venv", symlinks=True)
     (built,) = folder.glob("sb3_por-*.whl")
     install = [*pip, "--python", folder / "venv/bin/python", "install", "-q", "--no-deps", "--no-index", built]
-    subprocess.run(install, check=True, capture_output=True)
+    # With a checkout on PYTHONPATH pip would take the package for installed.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    subprocess.run(install, env=environment, check=True, capture_output=True)
     return folder / "venv"
 
 

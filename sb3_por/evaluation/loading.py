@@ -27,6 +27,7 @@ from sb3_por.runs.folder import (
     BEST_STATISTICS,
     HYPERPARAMETERS,
     STATISTICS,
+    import_names,
     read_settings,
     run_arguments,
     the_run,
@@ -164,7 +165,7 @@ def _arguments(
         return arguments
     missing = made_of.normalizes_observations and statistics is None
     if made_of.env_id == env_id.rpartition(":")[2]:
-        arguments["env_kwargs"] = whole_episodes(made_of.env_kwargs or {})
+        arguments["env_kwargs"] = whole_episodes(import_names(made_of.env_kwargs or {}))
         arguments["env_wrapper"] = import_wrappers(made_of.env_wrapper)
         arguments["vec_env_wrapper"] = import_wrappers(made_of.vec_env_wrapper)
     elif made_of.env_wrapper or made_of.vec_env_wrapper:

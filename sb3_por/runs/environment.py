@@ -10,7 +10,7 @@ import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.common.errors import UserError, one_line
-from sb3_por.runs.folder import dump_settings, parse_settings
+from sb3_por.runs.folder import dump_settings, import_names, parse_settings
 
 #: A function that wraps an environment
 EnvWrapper = Callable[[gym.Env], gym.Env]
@@ -62,10 +62,13 @@ class TrainingEnvironment:
     def of_data(cls, data: dict[str, Any]) -> "TrainingEnvironment | None":
         """
         :param data: Attributes of an SB3 model
-        :return: As :meth:`of_model`
+        :return: As :meth:`of_model`; None if the text cannot be read, too
         """
         text = data.get(ATTRIBUTE)
-        return cls(**parse_settings(text)) if isinstance(text, str) else None
+        try:
+            return cls(**parse_settings(text)) if isinstance(text, str) else None
+        except (TypeError, ValueError):
+            return None
 
     @property
     def normalizes_observations(self) -> bool:
@@ -108,6 +111,7 @@ def import_wrappers(spec: Any) -> Callable[[Any], Any] | None:
 
 
 def _import_wrapper(spec: Any) -> Callable[[Any], Any]:
+    spec = import_names(spec)
     path, arguments = next(iter(spec.items())) if isinstance(spec, dict) and len(spec) == 1 else (spec, None)
     try:
         return partial(resolve_name(path) if isinstance(path, str) else path, **(arguments or {}))

@@ -50,12 +50,16 @@ def intermediate_model(n_steps: int) -> str:
     return f"rl_model_{n_steps}_steps.zip"
 
 
+class ClassName(str):
+    """The dotted path of a class in settings. Reading settings imports nothing; ``import_names`` does."""
+
+
 class _Dumper(yaml.SafeDumper):
     """Writes plain YAML; tuples and classes with PyYAML's own tags, and other objects as their ``repr``."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads what ``_Dumper`` writes. A class that cannot be imported stays the name of one."""
+    """Reads the output of ``_Dumper``; classes become a ``ClassName``."""
 
 
 def _represent_class(dumper: yaml.SafeDumper, value: type) -> yaml.Node:
@@ -66,11 +70,8 @@ def _construct_tuple(loader: yaml.SafeLoader, node: Any) -> tuple[Any, ...]:
     return tuple(loader.construct_sequence(node, deep=True))
 
 
-def _construct_class(loader: yaml.SafeLoader, name: str, _: yaml.Node) -> Any:
-    try:
-        return resolve_name(name)
-    except (AttributeError, ImportError, ValueError):
-        return name
+def _construct_class(loader: yaml.SafeLoader, name: str, _: yaml.Node) -> ClassName:
+    return ClassName(name)
 
 
 _TUPLE, _NAME = "tag:yaml.org,2002:python/tuple", "tag:yaml.org,2002:python/name:"
@@ -78,6 +79,7 @@ _Dumper.add_multi_representer(object, lambda dumper, value: dumper.represent_str
 _Dumper.add_multi_representer(dict, lambda dumper, value: dumper.represent_dict(value))
 _Dumper.add_representer(tuple, lambda dumper, value: dumper.represent_sequence(_TUPLE, value))
 _Dumper.add_multi_representer(type, _represent_class)
+_Dumper.add_representer(ClassName, lambda dumper, value: dumper.represent_scalar(f"{_NAME}{value}", ""))
 _Loader.add_constructor(_TUPLE, _construct_tuple)
 _Loader.add_multi_constructor(_NAME, _construct_class)
 
@@ -93,13 +95,33 @@ def dump_settings(settings: dict[str, Any]) -> str:
 def parse_settings(text: str) -> dict[str, Any]:
     """
     :param text: YAML that ``dump_settings`` wrote
-    :return: Names and values
+    :return: Names and values; a class is a ``ClassName``
     :raises ValueError: If it is not YAML of names and values, or needs other Python objects
     """
     try:
         return dict(yaml.load(text, _Loader) or {})
     except (yaml.YAMLError, TypeError) as error:
         raise ValueError(one_line(error)) from error
+
+
+def import_names(value: Any) -> Any:
+    """
+    Import the classes that settings name. It runs the code of their modules: call it for settings that are to be used.
+
+    :param value: Settings, or a part of them
+    :return: The same with classes in the place of each ``ClassName``
+    :raises UserError: If one cannot be imported
+    """
+    if isinstance(value, ClassName):
+        try:
+            return resolve_name(value)
+        except (AttributeError, ImportError, ValueError) as error:
+            raise UserError(f"cannot import {value}: {one_line(error)}") from error
+    if isinstance(value, dict):
+        return {import_names(key): import_names(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(import_names(part) for part in value)
+    return value
 
 
 def write_settings(path: Path, settings: dict[str, Any]) -> None:

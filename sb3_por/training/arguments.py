@@ -20,7 +20,7 @@ from sb3_por.runs.checkpoints import (
     latest_checkpoint,
     remove_checkpoints,
 )
-from sb3_por.runs.folder import ARGUMENTS, last_model, run_arguments, the_run
+from sb3_por.runs.folder import ARGUMENTS, import_names, last_model, run_arguments, the_run
 from sb3_por.runs.provenance import current_commit, current_machine
 
 EXAMPLE = """example:
@@ -111,7 +111,7 @@ class Parser(argparse.ArgumentParser):
     def _resumed(self, run: Path) -> argparse.Namespace:
         """The arguments that a run was started with, changed by those given now."""
         run = the_run(run)
-        saved = run_arguments(run)
+        saved = import_names(run_arguments(run))
         if "env" not in saved:
             raise UserError(f"{run} is not the folder of a run: no */{ARGUMENTS} in it; give <log-folder>/<algo>/<env>_<n>")
         self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})

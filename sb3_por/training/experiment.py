@@ -46,6 +46,7 @@ from sb3_por.runs.folder import (
     REPLAY_BUFFER,
     STATISTICS,
     TENSORBOARD,
+    import_names,
     last_model,
     read_evaluations,
     read_settings,
@@ -110,7 +111,7 @@ class Experiment(ExperimentManager):
         if self._resumed_run is None:
             hyperparams, saved = super().read_hyperparameters()
         else:
-            saved = read_settings(self._resumed_run / self.env_name / HYPERPARAMETERS) | changes
+            saved = import_names(read_settings(self._resumed_run / self.env_name / HYPERPARAMETERS)) | changes
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         if isinstance(saved.get("normalize"), str):  # the zoo's files have Python as text there

@@ -15,7 +15,7 @@ from sb3_por.common.errors import UserError, UserNote
 from sb3_por.evaluation import evaluate
 from sb3_por.evaluation.loading import resolve
 from sb3_por.runs.environment import TrainingEnvironment, import_wrappers
-from sb3_por.runs.folder import dump_settings, parse_settings
+from sb3_por.runs.folder import dump_settings, import_names, parse_settings
 from sb3_por.training.zoo import main
 from softbody_envs.registration import task_class
 from softbody_envs.tasks.falling_ball import FallingBallEnv
@@ -122,7 +122,7 @@ def test_settings_keep_tuples_and_classes():
         "dtype": np.float32,
         "nested": [{"gymnasium.wrappers.ResizeObservation": {"shape": (4, 4)}}],
     }
-    assert parse_settings(dump_settings(settings)) == settings
+    assert import_names(parse_settings(dump_settings(settings))) == settings
     assert parse_settings("a: !!python/name:no_such.thing ''") == {"a": "no_such.thing"}
     with pytest.raises(ValueError, match="could not determine a constructor"):
         parse_settings("a: !!python/object/apply:os.getcwd []")

@@ -1,0 +1,46 @@
+"""Settings of a run keep tuples and classes, and reading them imports nothing."""
+
+import sys
+from collections import OrderedDict
+
+import pytest
+
+from sb3_por.common.errors import UserError
+from sb3_por.runs.environment import TrainingEnvironment, import_wrappers
+from sb3_por.runs.folder import dump_settings, import_names, parse_settings, read_settings, run_arguments
+
+SETTINGS = {"k": 3, "frames": (1, 2), "wrappers": [{"a.B": {"kind": OrderedDict, "nested": ({"of": dict},)}}], "none": None}
+
+
+def test_tuples_and_classes_come_back():
+    assert import_names(parse_settings(dump_settings(SETTINGS))) == SETTINGS
+    # Written again before anything was imported
+    assert import_names(parse_settings(dump_settings(parse_settings(dump_settings(SETTINGS))))) == SETTINGS
+
+
+@pytest.fixture
+def strangers_module(tmp_path, monkeypatch):
+    """A module that leaves a file behind when it is imported, and settings that name a class of it."""
+    (tmp_path / "strangers.py").write_text("import pathlib\npathlib.Path('ran').touch()\nclass Wrapper: pass\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield "!!python/name:strangers.Wrapper ''"
+    sys.modules.pop("strangers", None)
+
+
+def test_reading_runs_nothing(strangers_module, tmp_path):
+    (tmp_path / "Env-v0").mkdir()
+    for name in ("args.yml", "config.yml"):
+        (tmp_path / "Env-v0" / name).write_text(f"env: Env-v0\nalgo: {strangers_module}\nenv_wrapper: {strangers_module}\n")
+    settings = read_settings(tmp_path / "Env-v0" / "config.yml")
+    assert run_arguments(tmp_path)["env"] == settings["env"] == "Env-v0"
+    TrainingEnvironment.of_data({"training_environment": dump_settings({"env_id": "Env-v0", "env_wrapper": settings["algo"]})})
+    assert "strangers" not in sys.modules and not (tmp_path / "ran").exists()
+    # An evaluation needs the wrapper
+    assert import_wrappers(settings["env_wrapper"]) is not None
+    assert (tmp_path / "ran").exists()
+
+
+def test_a_class_that_does_not_exist_is_named():
+    with pytest.raises(UserError, match=r"cannot import no_such\.Thing"):
+        import_names(parse_settings("x: !!python/name:no_such.Thing ''"))

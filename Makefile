@@ -20,7 +20,7 @@ train: $(VENV)/.installed-test
 	$(BIN)/python train.py --algo sac_por --env PourWater-v0 $(ARGS)
 
 test: $(VENV)/.installed-test
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile $(ARGS)
 
 DEMO := demo/$(shell date +%Y%m%d-%H%M%S)
 DEMO_RUN := $(DEMO)/sac_por/PourWater-v0_1

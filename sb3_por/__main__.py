@@ -196,7 +196,8 @@ def _saliency(args: argparse.Namespace) -> None:
 
 
 def _suite_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", metavar="SUITE.yml", help="algos, envs, seeds, and what else a suite says")
+    names = "a file with algos, envs, seeds and more, or the name of a suite that comes along, such as main"
+    parser.add_argument("suite", metavar="SUITE.yml|NAME", help=names)
     parser.add_argument("--root", default="runs", help="runs go to <root>/<suite>/<env>/<algo>/seed_<seed> (default runs)")
     parser.add_argument("--dry-run", action="store_true", help="print the runs and their states, and do nothing")
     parser.add_argument(
@@ -266,7 +267,7 @@ COMMANDS = {
     ),
     "suite": Command(
         help="run what is left to do of a grid of algorithms, environments and seeds",
-        example="suites/smoke.yml --dry-run",
+        example="smoke --dry-run",
         add_arguments=_suite_arguments,
         run=_suite,
     ),

@@ -17,7 +17,7 @@ from sb3_por.analysis.scores import read_scores, write_csv
 from sb3_por.common.errors import UserError
 from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, LOCK, read_settings
 from sb3_por.suites.pools import LocalPool, Pool
-from sb3_por.suites.suite_file import Run, Suite, read_suite, suite_runs
+from sb3_por.suites.suite_file import Run, Suite, find_suite, read_suite, suite_runs
 
 #: Lines of a failed run's log that are shown.
 LOG_LINES = 8
@@ -27,15 +27,16 @@ def run_suite(path: str | Path, root: str | Path = "runs", dry_run: bool = False
     """
     Do what is left to do of a suite.
 
-    :param path: the suite file
+    :param path: the suite file, or the name of a suite that comes with this package
     :param root: the runs go to ``<root>/<name of the file>/<env>/<algo>/seed_<seed>``
     :param dry_run: print the runs and their states, and do nothing
     :param ray: address of a Ray cluster to do the runs on; on this machine if ``None``
     :return: 0 if every run is finished, 1 if some failed
     :raises UserError: if the file is wrong, or the cluster cannot be used
     """
+    path = find_suite(path)
     suite = read_suite(path)
-    folder = Path(root) / Path(path).stem
+    folder = Path(root) / path.stem
     runs = suite_runs(suite, folder)
     if dry_run:
         for run in runs:

@@ -10,6 +10,7 @@ import yaml
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por.common.errors import UserError, check_known, one_line
+from sb3_por.common.shipped import shipped
 from sb3_por.evaluation.loading import LOADABLE, import_packages
 from sb3_por.runs.folder import LOG, is_finished, run_arguments
 
@@ -139,6 +140,20 @@ _EXAMPLES = {
     "overrides": "{sac_por: {k: 3}}",
 }
 _REQUIRED = ("algos", "envs", "seeds")
+
+
+def find_suite(name: str | Path) -> Path:
+    """
+    :param name: a suite file, or the name of a suite that comes with this package, such as ``"main"``
+    :return: the file; one with a suffix need not exist
+    :raises UserError: if it is neither; the message has the nearest name
+    """
+    path = Path(name)
+    if path.suffix or path.is_file():
+        return path
+    suites = {file.stem: file for file in shipped("suites").glob("*.yml")}
+    check_known("suite", str(name), suites)
+    return suites[str(name)]
 
 
 def read_suite(path: str | Path) -> Suite:

@@ -15,6 +15,7 @@ from rl_zoo3.utils import StoreDict
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por.common.errors import UserError, check_known, one_line
 from sb3_por.common.files import check_writable
+from sb3_por.common.shipped import shipped
 from sb3_por.evaluation.loading import find_environment, import_packages, model_file, read_data
 from sb3_por.runs.checkpoints import (
     latest_checkpoint,
@@ -136,10 +137,8 @@ def hyperparameter_file(algo: str, env_id: str) -> Path:
 
     :raises UserError: if none fits
     """
-    package = Path(__file__).parents[1]
-    # At the top of a checkout; inside the package where it was installed without -e.
-    ours = next((f for f in (package.parent, package) if (f / "zoo_hyperparams").is_dir()), package) / "zoo_hyperparams"
-    files = [folder / f"{algo}.yml" for folder in (ours, Path(rl_zoo3.__file__).parent / "hyperparams")]
+    folders = shipped("zoo_hyperparams"), Path(rl_zoo3.__file__).parent / "hyperparams"
+    files = [folder / f"{algo}.yml" for folder in folders]
     entries = {file: yaml.safe_load(file.read_text()) for file in files if file.is_file()}
     for key in (env_id, "default"):
         for file, settings in entries.items():

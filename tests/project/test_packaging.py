@@ -49,8 +49,8 @@ def test_every_package_is_listed(options):
     found = {
         str(file.parent.relative_to(ROOT)).replace("/", ".") for p in PACKAGES for file in (ROOT / p).rglob("__init__.py")
     }
-    yaml_folders = {"sb3_por.zoo_hyperparams", "sb3_por.zoo_hyperparams.paper"}
-    assert listed == found | yaml_folders
+    shipped = {"suites", "zoo_hyperparams", "zoo_hyperparams.paper"}
+    assert listed == found | {f"sb3_por.shipped.{folder}" for folder in shipped}
 
 
 def test_every_import_is_a_declared_dependency(options):
@@ -137,13 +137,23 @@ def test_a_source_distribution_holds_the_suites_and_the_constraints(sdist):
 
 def test_an_installed_package_holds_its_data_and_finds_it(installed):
     (package,) = installed.glob("lib/python*/site-packages/sb3_por")
-    names = {path.name for path in (package / "zoo_hyperparams").glob("*.yml")}
-    assert names == {path.name for path in (ROOT / "zoo_hyperparams").glob("*.yml")}
+    for folder in ("suites", "zoo_hyperparams"):
+        there, here = (
+            {path.relative_to(data): path.read_bytes() for path in data.rglob("*.yml")}
+            for data in (package / "shipped" / folder, ROOT / folder)
+        )
+        assert there == here
     assert (package / "analysis" / "report.html.jinja").is_file()
     assert all((package.parent / name / "py.typed").is_file() for name in PACKAGES)
     script = "from sb3_por.training.arguments import hyperparameter_file as f; print(f('sac_por', 'PourWater-v0'))"
     shown = run_installed(installed, "python", "-c", script)
-    assert shown.stdout.strip() == str(package / "zoo_hyperparams" / "sac_por.yml"), shown.stderr
+    assert shown.stdout.strip() == str(package / "shipped" / "zoo_hyperparams" / "sac_por.yml"), shown.stderr
+
+
+def test_an_installed_package_runs_its_suites_by_name(installed):
+    shown = run_installed(installed, "sb3-por", "suite", "smoke", "--dry-run")
+    assert shown.returncode == 0 and shown.stdout.startswith("new "), shown.stderr
+    assert "runs/smoke/" in shown.stdout
 
 
 @pytest.mark.parametrize("script", ["sb3-por", "sb3-por-train"])

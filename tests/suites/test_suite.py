@@ -23,7 +23,7 @@ from sb3_por.common.errors import UserError
 from sb3_por.evaluation.loading import load_model
 from sb3_por.suites.pools import LocalPool
 from sb3_por.suites.run_suite import progress_table
-from sb3_por.suites.suite_file import Run, Suite, read_suite, suite_runs
+from sb3_por.suites.suite_file import Run, Suite, find_suite, read_suite, suite_runs
 from sb3_por.training.zoo import main as train
 
 ROOT = Path(__file__).parents[2]
@@ -136,6 +136,16 @@ def test_whatever_a_suite_file_holds_the_error_is_one_line(tmp_path_factory, tex
 def test_the_suites_that_come_along_are_sound():
     for file in (ROOT / "suites").glob("*.yml"):
         assert isinstance(read_suite(file), Suite)
+
+
+def test_a_suite_that_comes_along_is_found_by_name_from_anywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert find_suite("main") == ROOT / "suites" / "main.yml"
+    assert find_suite("main.yml") == Path("main.yml")
+    with pytest.raises(UserError, match="unknown suite 'smok'; did you mean smoke"):
+        find_suite("smok")
+    Path("main").write_text("a file of the user's")
+    assert find_suite("main") == Path("main")
 
 
 def test_dry_run_prints_commands_and_does_nothing(suite_file, tmp_path, capsys):

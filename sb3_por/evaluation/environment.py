@@ -3,7 +3,6 @@
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
@@ -11,6 +10,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_por.common.errors import UserError, one_line
+from sb3_por.common.frames import n_stacked
 from sb3_por.evaluation.episodes import FixedEpisodes, Model, evaluation_kwargs
 from sb3_por.runs.environment import EnvWrapper, VecEnvWrapper
 from softbody_envs.registration import task_class
@@ -82,7 +82,7 @@ def _stack_and_normalize(env: VecEnv, space: spaces.Space, statistics: str | Non
 
 
 def _stack(env: VecEnv, space: spaces.Space) -> VecEnv:
-    n_frames = _n_frames(space, env.observation_space)
+    n_frames = n_stacked(space, env.observation_space)
     if n_frames > 1:
         env = VecFrameStack(env, n_frames)
     return BaseAlgorithm._wrap_env(env, verbose=0, monitor_wrapper=False)  # channels first, as SB3 does in training
@@ -92,13 +92,3 @@ def _normalize(env: VecEnv, statistics: str) -> VecEnv:
     env = VecNormalize.load(statistics, env)
     env.training = env.norm_reward = False
     return env
-
-
-def _n_frames(stacked: spaces.Space, single: spaces.Space) -> int:
-    """Number of observations of one space that are stacked in one of another; 1 where that cannot be."""
-    if isinstance(stacked, spaces.Dict) and isinstance(single, spaces.Dict):
-        numbers = {_n_frames(part, single.spaces[key]) for key, part in stacked.spaces.items() if key in single.spaces}
-        return numbers.pop() if len(numbers) == 1 else 1
-    if isinstance(stacked, spaces.Box) and isinstance(single, spaces.Box):
-        return int(np.prod(stacked.shape)) // max(int(np.prod(single.shape)), 1)
-    return 1

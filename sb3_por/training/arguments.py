@@ -13,6 +13,7 @@ from rl_zoo3 import ALGOS
 from rl_zoo3.utils import StoreDict
 
 import softbody_envs  # noqa: F401  (registers its ids)
+from sb3_por import ALGORITHMS
 from sb3_por.common.errors import UserError, check_known, one_line
 from sb3_por.common.files import check_writable
 from sb3_por.common.shipped import shipped
@@ -86,6 +87,8 @@ class Parser(argparse.ArgumentParser):
             metavar="RUN_FOLDER",
             help="resume an interrupted run with the settings in its folder, or extend a finished one to -n steps",
         )
+        demos = "folder of demonstrations, from which half of each batch is drawn; see python -m sb3_por record"
+        self.add_argument("--demos", metavar="FOLDER", help=demos)
         self.add_argument("--label", metavar="NAME", help="what tables and figures call the run, instead of its algorithm")
         args = super().parse_args()
         if args.resume:
@@ -95,6 +98,8 @@ class Parser(argparse.ArgumentParser):
         if args.track and importlib.util.find_spec("wandb") is None:
             raise UserError("--track needs Weights & Biases: pip install wandb")
         check_known("algorithm", args.algo, ALGOS)
+        if args.demos and args.algo not in ALGORITHMS:
+            raise UserError(f"{args.algo} cannot learn from demonstrations; --demos needs one of {', '.join(ALGORITHMS)}")
         import_packages(args.gym_packages)
         args.env = find_environment(args.env)
         if args.trained_agent:

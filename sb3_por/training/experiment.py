@@ -54,6 +54,7 @@ from sb3_por.runs.folder import (
 )
 from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
 from sb3_por.training.trials import trial_settings
+from sb3_por.visual.algorithm import VisualAlgorithm
 
 
 def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
@@ -106,6 +107,8 @@ class Experiment(ExperimentManager):
         if self.storage and self.study_name and not self.optimize_hyperparameters and self._resumed_run is None:
             changes = trial_settings(self.algo, self.storage, self.study_name, self.trial_id) | changes
         self.trial_id = None
+        if self.args.demos:
+            changes["demos"] = self.args.demos
         given, self.env_kwargs = {**(changes.pop("env_kwargs", None) or {}), **self.env_kwargs}, {}
         self.custom_hyperparams = changes
         if self._resumed_run is None:
@@ -160,6 +163,8 @@ class Experiment(ExperimentManager):
         """
         try:
             experiment = super().setup_experiment()
+            if experiment is not None and isinstance(experiment[0], VisualAlgorithm) and experiment[0].demos:
+                experiment[0].load_demos(experiment[0].demos)
         except (AssertionError, TypeError, ValueError, RuntimeError, gym.error.Error) as error:
             if self._folder_made:
                 shutil.rmtree(self.save_path, ignore_errors=True)

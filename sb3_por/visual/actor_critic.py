@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import polyak_update, update_learning_rate
+from torch.nn import functional as F
 
 from sb3_por.visual.algorithm import VisualAlgorithm
-from sb3_por.visual.batch import Frames, encode, repeat, take
+from sb3_por.visual.batch import Frames, demonstrated, encode, interleave, repeat, take
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 
 
@@ -121,7 +122,7 @@ class VisualActorCritic(VisualAlgorithm, ABC):
 
         self._step_encoder(losses)
         if self._n_updates % self.actor_update_interval == 0:
-            self._step_actor(losses)
+            self._step_actor(batch, losses)
         # After the encoder's step, so that the targets' batch norm statistics are the current ones
         if self._n_updates % self.target_update_interval == 0:
             self._update_targets()
@@ -175,7 +176,7 @@ class VisualActorCritic(VisualAlgorithm, ABC):
             parameter.grad = gradient
         own_optimizer.step()
 
-    def _step_actor(self, losses: Losses) -> None:
+    def _step_actor(self, batch: Any, losses: Losses) -> None:
         """One step of actor and temperature. No gradient reaches critic and encoder."""
         # The encoder has changed since its loss, the trunk's features are those of before
         trunk = losses.trunk_t if self.actor.detach_trunk else self.actor.trunk(losses.present)
@@ -183,7 +184,14 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         with th.no_grad():
             features = self.critic.projection(losses.trunk_t)
         temperature = self.temperature
-        actor_loss = (temperature * log_prob - self._actor_values(features, actions)).mean()
+        values = self._actor_values(features, actions)
+        actor_loss = (temperature * log_prob - values).mean()
+        if self.demo_buffer is not None and self.bc_coef > 0:
+            cloning_loss = self._cloning_loss(batch, trunk)
+            # In units of the values, so that one weight fits all scales of rewards; fades to 0 at the end of training
+            weight = self.bc_coef * self._current_progress_remaining * values.detach().std()
+            actor_loss = actor_loss + weight * cloning_loss
+            self._metrics.add("cloning_loss", cloning_loss)
         self.actor.optimizer.zero_grad()
         # Named inputs: the critic's weights get no gradient, and none is computed for them
         actor_loss.backward(inputs=[p for group in self.actor.optimizer.param_groups for p in group["params"]])
@@ -197,6 +205,12 @@ class VisualActorCritic(VisualAlgorithm, ABC):
             ent_coef_loss.backward()
             self.ent_coef_optimizer.step()
             self._metrics.add("ent_coef_loss", ent_coef_loss)
+
+    def _cloning_loss(self, batch: Any, trunk: th.Tensor) -> th.Tensor:
+        """Mean squared error of the deterministic action in the batch's demonstrations."""
+        mean, log_std, kwargs = self.actor.dist_params(demonstrated(trunk))
+        actions = self.actor.action_dist.actions_from_params(mean, log_std, deterministic=True, **kwargs)
+        return F.mse_loss(actions, demonstrated(batch.actions))
 
     def _update_targets(self) -> None:
         """theta_m <- tau theta_o + (1 - tau) theta_m for encoder and Q networks, each with its tau."""
@@ -242,10 +256,19 @@ class VisualActorCritic(VisualAlgorithm, ABC):
     def sample(self, batch_size: int, replay_buffer: Any = None) -> Any:
         """
         :param batch_size: Number of transitions
-        :param replay_buffer: Buffer to sample from; the model's own by default
+        :param replay_buffer: Buffer to sample from; by default the model's own, and the demonstrations for every second row
         :return: Samples with the frames that the objective uses
         """
-        buffer = self.replay_buffer if replay_buffer is None else replay_buffer
+        if replay_buffer is not None:
+            return self._sample(batch_size, replay_buffer)
+        if self.demo_buffer is None:
+            return self._sample(batch_size, self.replay_buffer)
+        n_demos = batch_size // 2
+        own = self._sample(batch_size - n_demos, self.replay_buffer)
+        return interleave(own, self._sample(n_demos, self.demo_buffer))
+
+    def _sample(self, batch_size: int, buffer: Any) -> Any:
+        """Samples of one buffer."""
         normalizer, objective = self._vec_normalize_env, self.policy.objective
         if objective is None or not isinstance(buffer, SequenceReplayBuffer):
             return buffer.sample(batch_size, env=normalizer)

@@ -12,13 +12,17 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_por.acceleration.overlap import OverlappedTraining
 from sb3_por.acceleration.precision import check_precision
 from sb3_por.acceleration.updates import AcceleratedUpdates
 from sb3_por.common.checks import check_ranges, check_types
+from sb3_por.common.errors import UserError
 from sb3_por.common.random_state import SavedRandomState
 from sb3_por.common.running_means import RunningMeans
+from sb3_por.demonstrations.dataset import Demonstrations
+from sb3_por.demonstrations.playback import fill, n_transitions
 from sb3_por.objectives.base import Objective
 from sb3_por.visual.batch import Augmentation
 from sb3_por.visual.normalization import transpose_inside
@@ -34,6 +38,7 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("learning_rate", "learning_starts", "augmentation_pad", "por_coef"), (0, MAX)),
     **dict.fromkeys(("ent_coef_lr_ratio", "aux_lr_ratio", "ent_coef"), (0, MAX)),
     "gradient_steps": (-1, MAX),
+    "bc_coef": (0, MAX),
     "reward_scale": (-MAX, MAX),
 }
 
@@ -49,6 +54,9 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
     #: Default of ``encoder_tau``, in units of ``tau``
     encoder_tau_ratio: ClassVar[float] = 1.0
 
+    #: Replay buffer of the demonstrations; None for none
+    demo_buffer: Any = None
+
     #: Learning rate of an objective that has an optimizer of its own, in units of ``learning_rate``
     aux_lr_ratio: float = 1.0
 
@@ -62,6 +70,8 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
     n_augmentations: int
     n_target_augmentations: int
     diagnostics_interval: int
+    demos: str | None
+    bc_coef: float
     precision: str
     compile_mode: str | None
 
@@ -69,6 +79,7 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
     policy: Any
     actor: Any
     replay_buffer: Any
+    replay_buffer_class: Any
     critic: Any
     critic_target: Any
     ent_coef_optimizer: Any
@@ -174,6 +185,8 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         :return: The model
         """
         name = type(self).__name__ if tb_log_name is None else tb_log_name
+        if self.demos is not None and self.demo_buffer is None:
+            self.load_demos(self.demos)
         return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
 
     @staticmethod
@@ -193,6 +206,30 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
                 critic.projection.load_state_dict(other.critic.projection.state_dict())
         except RuntimeError as error:
             raise ValueError(f"the encoder of {type(other).__name__} has another shape: {error}") from error
+
+    def load_demos(self, path: str | pathlib.Path) -> None:
+        """
+        Draw half of each batch from demonstrations. ``learn()`` does so for the folder that ``demos`` names.
+
+        :param path: Folder of a Minari dataset whose episodes were played in the training environment
+        :raises UserError: If it cannot be read, or does not fit
+        """
+        if issubclass(self.replay_buffer_class, HerReplayBuffer):
+            raise UserError("demonstrations cannot be relabelled: HerReplayBuffer and demos exclude each other")
+        if self.batch_size < 2:
+            raise UserError("half of each batch comes from the demonstrations: batch_size must be at least 2")
+        demonstrations, own = Demonstrations(path), self.replay_buffer
+        buffer = self.replay_buffer_class(
+            n_transitions(demonstrations),
+            own.observation_space,
+            own.action_space,
+            device=self.device,
+            n_envs=1,
+            optimize_memory_usage=self.optimize_memory_usage,
+            **self.replay_buffer_kwargs,
+        )
+        fill(buffer, demonstrations)
+        self.demos, self.demo_buffer = str(path), buffer
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
@@ -218,4 +255,4 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         return [*state_dicts, *own], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_augmentation", "_acceleration"]
+        return [*super()._excluded_save_params(), "_metrics", "_augmentation", "_acceleration", "demo_buffer"]

@@ -125,6 +125,34 @@ def encode(frames: Frames, batch: Any, objective: Objective, s_t: th.Tensor, s_n
     )
 
 
+def interleave(own: Any, demos: Any) -> Any:
+    """
+    :param own: Samples of the agent's own replay buffer, a named tuple
+    :param demos: Samples of the demonstrations, as many or one less
+    :return: One batch with rows of both in turn, so that either half of it holds both in equal parts
+    """
+
+    def both(one: Any, other: Any) -> Any:
+        if one is None:
+            return None
+        if isinstance(one, dict):
+            return {key: both(one[key], other[key]) for key in one}
+        # Images keep their layout in memory
+        rows = one.new_empty_strided((len(one) + len(other), *one.shape[1:]), one.stride())
+        rows[0::2], rows[1::2] = one, other
+        return rows
+
+    return type(own)(*map(both, own, demos))
+
+
+def demonstrated(rows: th.Tensor) -> th.Tensor:
+    """
+    :param rows: A tensor with a row for each sample of :func:`interleave`
+    :return: The rows of the demonstrations
+    """
+    return rows[1::2]
+
+
 def take(observations: PyTorchObs, n: int) -> PyTorchObs:
     """
     :param observations: A tensor, or a dict of tensors

@@ -11,6 +11,7 @@ LAYERS = (
     "common",
     "objectives",
     "acceleration",
+    "demonstrations",
     "visual",
     "algorithms",
     "runs",

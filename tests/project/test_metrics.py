@@ -46,8 +46,11 @@ class Names(KVWriter):
 
 def logged_names(cls, folder):
     writer = Names()
-    arguments = dict(policy_kwargs=POLICY, buffer_size=100, learning_starts=20, batch_size=8, diagnostics_interval=5)
+    arguments = dict(
+        policy_kwargs=POLICY, buffer_size=100, learning_starts=20, batch_size=8, diagnostics_interval=5, bc_coef=1.0
+    )
     model = cls("CnnPolicy", ScoredDotEnv(size=20), device="cpu", **arguments)
+    model.demo_buffer = model.replay_buffer  # what the agent has played, in the place of demonstrations
     model.set_logger(Logger(folder=None, output_formats=[writer]))
     env = DummyVecEnv([lambda: FixedEpisodes(Monitor(ScoredDotEnv(size=20)))])
     callback = EvaluationCallback(env, [Episode(0, 0, None)], 40, folder, Stopwatch(), verbose=0)

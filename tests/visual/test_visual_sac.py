@@ -49,12 +49,13 @@ def test_unshared_actor_trains_a_trunk_of_its_own():
 
 def test_critic_loss_trains_the_encoder_and_actor_loss_leaves_no_gradient_there():
     model = make_model()
-    losses = model.losses(model.sample(8))
+    batch = model.sample(8)
+    losses = model.losses(batch)
     losses.critic.backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.critic.encoder_parameters())
     model.critic.optimizer.zero_grad()
     before = snapshot(model.actor.own_parameters())
-    model._step_actor(losses)
+    model._step_actor(batch, losses)
     assert all(p.grad is None for p in model.critic.parameters())
     assert not same(before, model.actor.own_parameters())
 

@@ -29,7 +29,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 import softbody_envs  # noqa: F401  registers the tasks
 from sb3_por.acceleration.precision import PRECISIONS
-from sb3_por.algorithms import SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ
+from sb3_por.algorithms import SACCURL, SACMRQ, SACPOR, SACSPR, TQCPOR, SACDrQ
 from sb3_por.visual.encoders import ConvEncoder, make_projection
 from sb3_por.visual.sac import VisualSAC
 
@@ -64,6 +64,7 @@ ALGORITHMS: dict[str, tuple[type[Any], dict[str, Any], tuple[float, float, int]]
     "sac_drq": (SACDrQ, {}, (2, 4, 0)),
     "sac_curl": (SACCURL, {}, (1, 3, 1)),  # a second augmentation
     "sac_spr": (SACSPR, {}, (1, 7, 1)),  # a window of five frames
+    "sac_mrq": (SACMRQ, {}, (1, 7, 1)),
 }
 
 

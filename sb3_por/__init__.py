@@ -7,6 +7,7 @@ if TYPE_CHECKING:
     from sb3_por.algorithms import ALGORITHMS
     from sb3_por.algorithms.sac_curl import SACCURL
     from sb3_por.algorithms.sac_drq import SACDrQ
+    from sb3_por.algorithms.sac_mrq import SACMRQ
     from sb3_por.algorithms.sac_por import SACPOR
     from sb3_por.algorithms.sac_spr import SACSPR
     from sb3_por.algorithms.tqc_por import TQCPOR
@@ -15,13 +16,14 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["ALGORITHMS", "SACCURL", "SACPOR", "SACSPR", "TQCPOR", "SACDrQ", "VisualSAC", "VisualTQC", "__version__"]
+__all__ = ["ALGORITHMS", "SACCURL", "SACMRQ", "SACPOR", "SACSPR", "TQCPOR", "SACDrQ", "VisualSAC", "VisualTQC", "__version__"]
 
 #: Public name -> its module, which is imported when the name is first used: PyTorch takes seconds to import
 _MODULES = {
     "ALGORITHMS": "sb3_por.algorithms",
     "SACCURL": "sb3_por.algorithms.sac_curl",
     "SACDrQ": "sb3_por.algorithms.sac_drq",
+    "SACMRQ": "sb3_por.algorithms.sac_mrq",
     "SACPOR": "sb3_por.algorithms.sac_por",
     "SACSPR": "sb3_por.algorithms.sac_spr",
     "TQCPOR": "sb3_por.algorithms.tqc_por",

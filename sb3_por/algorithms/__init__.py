@@ -2,6 +2,7 @@
 
 from sb3_por.algorithms.sac_curl import SACCURL
 from sb3_por.algorithms.sac_drq import SACDrQ
+from sb3_por.algorithms.sac_mrq import SACMRQ
 from sb3_por.algorithms.sac_por import SACPOR
 from sb3_por.algorithms.sac_spr import SACSPR
 from sb3_por.algorithms.tqc_por import TQCPOR
@@ -13,5 +14,6 @@ ALGORITHMS: dict[str, type[VisualActorCritic]] = {
     "sac_drq": SACDrQ,
     "sac_curl": SACCURL,
     "sac_spr": SACSPR,
+    "sac_mrq": SACMRQ,
     "tqc_por": TQCPOR,
 }

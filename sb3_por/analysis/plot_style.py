@@ -17,19 +17,20 @@ from sb3_por.common.files import atomic_write, check_output
 
 #: Colours of the algorithms that the documentation compares. A look depends on the name alone, so that an algorithm looks
 #: the same in every figure, independent of the others. These are Okabe and Ito's colours, which readers with any colour
-#: vision can tell apart (brown stands for their yellow, which is faint on white).
+#: vision can tell apart (brown stands for their yellow, which is faint on white), and a wine red.
 COLORS = {
     "sac_por": "#0072B2",
     "sac_drq": "#D55E00",
     "sac_curl": "#009E73",
     "sac_spr": "#CC79A7",
+    "sac_mrq": "#882255",
     "tqc_por": "#56B4E9",
     "sac": "#000000",
     "por_lambda_0": "#E69F00",
     "por_paper": "#8C510A",
 }
 #: Colours of all other names: Tol's "muted" scheme, without those close to one above.
-OTHER_COLORS = ("#332288", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499")
+OTHER_COLORS = ("#332288", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#AA4499")
 #: Line styles and markers keep curves apart in grey print.
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), (0, (8, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "p", "h", "X")

@@ -24,6 +24,7 @@ class EncodedBatch:
     :param positive: f_m of another augmentation of o_t, shape ``(batch, features_dim)``
     :param window: f_m(o_{t+1}), ..., f_m(o_{t+K}), shape ``(batch, K, features_dim)``
     :param window_actions: a_t, ..., a_{t+K-1}, shape ``(batch, K, action_dim)``
+    :param window_rewards: r_t, ..., r_{t+K-1}, shape ``(batch, K)``
     :param window_mask: 1 where a step of the window belongs to the episode, else 0, shape ``(batch, K)``
     """
 
@@ -34,6 +35,7 @@ class EncodedBatch:
     positive: th.Tensor | None = None
     window: th.Tensor | None = None
     window_actions: th.Tensor | None = None
+    window_rewards: th.Tensor | None = None
     window_mask: th.Tensor | None = None
 
 

@@ -58,9 +58,9 @@ def contrastive(trial: optuna.Trial) -> dict[str, Any]:
     return {"aux_lr_ratio": _aux_lr_ratio(trial)}
 
 
-def self_predictive(trial: optuna.Trial) -> dict[str, Any]:
+def latent_model(trial: optuna.Trial) -> dict[str, Any]:
     """
-    :return: step size and horizon of SPR's loss
+    :return: step size and horizon of the loss of SPR or MR.Q
     """
     return {
         "aux_lr_ratio": _aux_lr_ratio(trial),
@@ -74,7 +74,8 @@ SEARCH_SPACES: dict[str, Space] = {
     "tqc_por": partial_order,
     "sac_drq": augmentations,
     "sac_curl": contrastive,
-    "sac_spr": self_predictive,
+    "sac_spr": latent_model,
+    "sac_mrq": latent_model,
 }
 
 

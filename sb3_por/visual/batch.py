@@ -121,6 +121,7 @@ def encode(frames: Frames, batch: Any, objective: Objective, s_t: th.Tensor, s_n
         positive=positive,
         window=window,
         window_actions=getattr(batch, "window_actions", None),
+        window_rewards=getattr(batch, "window_rewards", None),
         window_mask=getattr(batch, "window_mask", None),
     )
 

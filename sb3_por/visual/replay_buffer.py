@@ -33,6 +33,7 @@ class SequenceSamples(NamedTuple):
         first frame
     :param window_observations: o_{t+1} .. o_{t+K}, ``(batch, K, ...)``
     :param window_actions: a_t .. a_{t+K-1}, ``(batch, K, action_dim)``
+    :param window_rewards: r_t .. r_{t+K-1}, ``(batch, K)``
     :param window_mask: 1 where a step of the window belongs to the episode, ``(batch, K)``; the others repeat the last
     """
 
@@ -48,6 +49,7 @@ class SequenceSamples(NamedTuple):
     past_gaps: th.Tensor | None = None
     window_observations: Observations | None = None
     window_actions: th.Tensor | None = None
+    window_rewards: th.Tensor | None = None
     window_mask: th.Tensor | None = None
 
 
@@ -356,7 +358,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         :param future: Also sample the frame k steps later, with k drawn uniformly from this closed range; the last
             frame of the episode where it ends earlier
         :param past: Also sample the frame k steps earlier; the first frame of the episode where it begins later
-        :param window: Also sample this number of following frames and the actions before each of them
+        :param window: Also sample this number of following frames, and the actions and rewards before each of them
         :return: The samples, on ``device``
         """
         slots = np.random.randint(0, self.size(), size=batch_size)
@@ -412,7 +414,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         return (self._normalize_reward(rewards, env) * discounts).sum(axis=1)
 
     def _window(self, slots: np.ndarray, envs: np.ndarray, length: int, env: VecNormalize | None) -> dict[str, Any]:
-        """The next ``length`` frames, the actions before them, and which of them belong to the episode."""
+        """The next ``length`` frames, the actions and rewards before them, and which of them belong to the episode."""
         steps_left = self._steps_left(slots, envs, length)[:, None]
         steps = np.arange(length)
         window_slots = (slots[:, None] + np.minimum(steps, steps_left - 1)) % self.buffer_size
@@ -420,6 +422,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         return dict(
             window_observations=self._gather(self._next_rows(window_slots, window_envs), env),
             window_actions=self.to_torch(self.actions[window_slots, window_envs], copy=False),
+            window_rewards=self.to_torch(self._normalize_reward(self.rewards[window_slots, window_envs], env), copy=False),
             window_mask=self.to_torch((steps < steps_left).astype(np.float32), copy=False),
         )
 

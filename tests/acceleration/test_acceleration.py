@@ -8,7 +8,7 @@ import pytest
 import torch as th
 from toy_envs import DotEnv
 
-from sb3_por import SACCURL, SACPOR, SACSPR, SACDrQ
+from sb3_por import SACCURL, SACMRQ, SACPOR, SACSPR, SACDrQ
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
@@ -69,7 +69,7 @@ def test_every_network_of_an_update_is_compiled(monkeypatch):
     assert len(graphs) >= 2 + 4 + 1 + 3
 
 
-@pytest.mark.parametrize("cls", [SACPOR, SACDrQ, SACCURL, SACSPR])
+@pytest.mark.parametrize("cls", [SACPOR, SACDrQ, SACCURL, SACSPR, SACMRQ])
 def test_what_compiled_networks_return_is_not_used_after_the_update(cls, monkeypatch):
     """CUDA graphs write the next update's results, gradients too, to where those of the last one were."""
     returned, modules = [], []

@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from toy_envs import DotEnv
 
-from sb3_por import SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualSAC
+from sb3_por import SACCURL, SACMRQ, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualSAC
 
 pytestmark = pytest.mark.skipif(not th.cuda.is_available(), reason="there is no GPU")
 
@@ -25,7 +25,7 @@ def parameters(model):
 
 
 @pytest.mark.parametrize("storage", ["auto", "cpu"])
-@pytest.mark.parametrize("cls", [VisualSAC, SACPOR, SACDrQ, SACCURL, SACSPR, TQCPOR])
+@pytest.mark.parametrize("cls", [VisualSAC, SACPOR, SACDrQ, SACCURL, SACSPR, SACMRQ, TQCPOR])
 def test_no_update_waits_for_the_gpu(cls, storage):
     model = train(cls, replay_buffer_kwargs=dict(storage=storage))
     assert model.replay_buffer._frames[""].ring.device.type == ("cuda" if storage == "auto" else "cpu")
@@ -41,7 +41,7 @@ def test_lower_precision_trains(precision):
     train(precision=precision)
 
 
-@pytest.mark.parametrize("cls", [SACPOR, SACDrQ, SACCURL, SACSPR])
+@pytest.mark.parametrize("cls", [SACPOR, SACDrQ, SACCURL, SACSPR, SACMRQ])
 def test_cuda_graphs_train(cls):
     train(cls, compile_mode="reduce-overhead")
 

@@ -68,6 +68,7 @@ def train_on_both(**options):
         dict(cls="SACDrQ"),
         dict(cls="SACCURL"),
         dict(cls="SACSPR"),
+        dict(cls="SACMRQ"),
         dict(cls="TQCPOR"),
         dict(n_steps=3, start_at_mean_reward=True, reward_scale=20.0),
         dict(use_sde=True),

@@ -19,14 +19,14 @@ import pytest
 import stable_baselines3
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_por import ALGORITHMS, SACPOR, SACSPR
+from sb3_por import ALGORITHMS, SACMRQ, SACPOR, SACSPR
 
 #: Tests of what is different on purpose -> why.
 DIFFERENT = {
     "test_n_steps_with_dict_obs[None]": "n-step returns work with Dict observations",
     "test_warn_buffer[True-": "optimize_memory_usage changes nothing: the buffer knows that a second learn() resets",
 }
-#: The same for POR and SPR, which refuse a buffer that cannot sample the frames that their objectives need.
+#: The same for POR, SPR and MR.Q, which refuse a buffer that cannot sample the frames that their objectives need.
 REFUSED = {
     "test_n_steps_warns_with_custom_replay_buffer_class[NStepReplayBuffer]": "NStepReplayBuffer is refused",
     "test_n_steps_custom_class_no_warnings": "NStepReplayBuffer is refused",
@@ -38,7 +38,7 @@ class InSACsPlace:
 
     def __init__(self, algorithm: type[BaseAlgorithm]):
         self.algorithm = algorithm
-        self.different = DIFFERENT | (REFUSED if algorithm in (SACPOR, SACSPR) else {})
+        self.different = DIFFERENT | (REFUSED if algorithm in (SACMRQ, SACPOR, SACSPR) else {})
         stable_baselines3.SAC = algorithm
 
     def _concerned(self, item: pytest.Function) -> bool:

@@ -1,4 +1,4 @@
-"""CURL and SPR on tasks that only they can explain; every algorithm runs, saves and learns."""
+"""CURL, SPR and MR.Q's objective on tasks that only they can explain; every algorithm runs, saves and learns."""
 
 import math
 
@@ -8,8 +8,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from torch import nn
 from toy_envs import DotEnv
 
-from sb3_por import ALGORITHMS, SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualTQC
-from sb3_por.objectives import Contrastive, EncodedBatch, SelfPredictive
+from sb3_por import ALGORITHMS, SACCURL, SACMRQ, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualTQC
+from sb3_por.objectives import Contrastive, EncodedBatch, ModelBased, SelfPredictive
+from sb3_por.objectives.mrq import two_hot
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
@@ -77,7 +78,9 @@ def make_rollouts(actions_shown):
     """A point moves as the actions say; the objective may be shown other actions."""
     start, actions = th.randn(64, 2), th.randn(64, 3, 2)
     window = start[:, None] + actions.cumsum(dim=1)
-    return {"obs": start, "window": window, "window_actions": actions_shown(actions), "window_mask": th.ones(64, 3)}
+    rewards = window[:, :, 0]
+    shown = {"window_actions": actions_shown(actions), "window_rewards": rewards, "window_mask": th.ones(64, 3)}
+    return {"obs": start, "window": window, **shown}
 
 
 def test_spr_predicts_what_the_actions_do():
@@ -119,7 +122,58 @@ def test_spr_loss_is_the_sum_over_steps_of_2_minus_2_cosines():
     assert metrics["loss"].item() == pytest.approx(total.item() / 3, rel=1e-5)
 
 
-@pytest.mark.parametrize("make", [lambda: Contrastive(8, 2), lambda: SelfPredictive(8, 2, horizon=3)])
+def test_mrq_predicts_what_the_actions_do_and_earn():
+    metrics = {}
+    for name, shown in (("true", lambda actions: actions), ("other", th.randn_like)):
+        th.manual_seed(0)
+        objective = ModelBased(8, 2, horizon=3)
+        metrics[name] = train(objective, lambda shown=shown: make_rollouts(shown), in_dim=2)[1]
+    assert metrics["true"]["dynamics_error"] < 0.5 * metrics["other"]["dynamics_error"]
+    assert metrics["true"]["reward_loss"] < 0.8 * metrics["other"]["reward_loss"]
+
+
+def test_mrq_ignores_what_is_after_the_episode():
+    th.manual_seed(0)
+    objective, encoder = ModelBased(8, 2, horizon=3), LinearEncoder(2, 8)
+    rollouts = make_rollouts(lambda actions: actions)
+    rollouts["window_mask"][:, 1:] = 0
+    loss, metrics = objective.loss(encode(encoder, encoder, **rollouts))
+    for name in ("window", "window_actions", "window_rewards"):
+        rollouts[name][:, 1:] += 5
+    again, metrics_again = objective.loss(encode(encoder, encoder, **rollouts))
+    th.testing.assert_close(again, loss)
+    th.testing.assert_close(metrics_again, metrics)
+
+
+def test_mrq_loss_is_the_sum_over_steps_of_the_errors_of_features_and_rewards():
+    th.manual_seed(0)
+    objective, encoder = ModelBased(8, 2, horizon=3), LinearEncoder(2, 8)
+    rollouts = make_rollouts(lambda actions: actions)
+    loss, _ = objective.loss(encode(encoder, encoder, **rollouts))
+    latent, total = encoder(rollouts["obs"]), 0.0
+    for k in range(3):
+        outputs = objective.model(th.cat([latent, rollouts["window_actions"][:, k]], dim=1))
+        latent, log_probabilities = outputs[:, :8], outputs[:, 8:].log_softmax(dim=1)
+        total += (latent - encoder(rollouts["window"][:, k])).square().mean()
+        total += 0.1 * -(two_hot(rollouts["window_rewards"][:, k]) * log_probabilities).sum(dim=1).mean()
+    assert loss.item() == pytest.approx(total.item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3, -7.0, 1e4])
+def test_two_hot_weights_keep_the_value(value):
+    weights = two_hot(th.tensor([value]))
+    assert weights.sum().item() == pytest.approx(1.0) and (weights > 0).sum() <= 2
+    symlog = (weights * th.linspace(-10, 10, 65)).sum()
+    assert (symlog.sign() * symlog.abs().expm1()).item() == pytest.approx(value, rel=1e-3, abs=1e-5)
+
+
+def test_two_hot_holds_at_the_largest_value():
+    assert two_hot(th.tensor([1e9]))[0, -1] == 1.0
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: Contrastive(8, 2), lambda: SelfPredictive(8, 2, horizon=3), lambda: ModelBased(8, 2, horizon=3)]
+)
 def test_gradients_reach_online_encoder_and_objective_and_nothing_else(make):
     th.manual_seed(0)
     objective, encoder, momentum = make(), LinearEncoder(2, 8), LinearEncoder(2, 8).requires_grad_(False)
@@ -176,7 +230,7 @@ def test_drq_has_one_tau_and_two_augmentations_of_each():
     assert (model.momentum_tau, model.n_augmentations, model.n_target_augmentations) == (model.tau, 2, 2)
 
 
-@pytest.mark.parametrize("cls", [SACCURL, SACSPR])
+@pytest.mark.parametrize("cls", [SACCURL, SACSPR, SACMRQ])
 def test_the_critic_cannot_drown_out_an_objective_with_an_optimizer_of_its_own(cls):
     moved = []
     for reward_scale in (1.0, 1e6):
@@ -206,7 +260,7 @@ def test_an_objective_without_one_is_trained_with_the_critic():
 @pytest.mark.timeout(900)
 def test_every_algorithm_improves_from_pixels(name):
     env = DotEnv(size=20, falling=True)
-    kwargs = dict(horizon=2) if name == "sac_spr" else {}
+    kwargs = dict(horizon=2) if name in ("sac_spr", "sac_mrq") else {}
     model = make_model(
         ALGORITHMS[name],
         env,

@@ -120,6 +120,7 @@ def check(buffer, naive, batch_size=400, k=(1, 5), window=5):
         assert samples.window_mask[i].tolist() == [1.0] * m + [0.0] * (window - m)
         assert decode(samples.window_observations)[i, :m].tolist() == record["frames"][t + 1 : t + m + 1]
         assert np.array_equal(samples.window_actions[i, :m], np.stack(record["actions"][t : t + m]))
+        assert samples.window_rewards[i, :m].tolist() == pytest.approx(record["rewards"][t : t + m], abs=1e-5)
     return seen
 
 

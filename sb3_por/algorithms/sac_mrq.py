@@ -65,6 +65,9 @@ class SACMRQ(VisualSAC):
     :param n_target_augmentations: Augmentations of each next observation, whose targets are averaged (DrQ's K)
     :param diagnostics_interval: Log the objective's control and the gradient norm of each loss with respect to the encoder
         every ``diagnostics_interval`` updates
+    :param demos: Folder of demonstrations in Minari's format, from which half of each batch is drawn; ``learn()`` reads it
+    :param bc_coef: Weight of the behaviour-cloning loss on the demonstrations at the start of training, in units of the
+        standard deviation of the values in a batch. It falls linearly with the remaining progress, to 0 at the end
     :param overlap: Train while the environments step; pays with worker processes (``SubprocVecEnv``)
     :param precision: Precision of the updates: ``"float32"``, ``"tf32"`` (matrix products and convolutions of a GPU; a
         setting of the whole process) or ``"bfloat16"`` (trunks only: Q values and probabilities need more)
@@ -117,6 +120,8 @@ class SACMRQ(VisualSAC):
         n_augmentations: int = 1,
         n_target_augmentations: int = 1,
         diagnostics_interval: int = 200,
+        demos: str | None = None,
+        bc_coef: float = 0.0,
         overlap: bool = False,
         precision: str = "float32",
         compile_mode: str | None = None,
@@ -161,6 +166,8 @@ class SACMRQ(VisualSAC):
             n_augmentations=n_augmentations,
             n_target_augmentations=n_target_augmentations,
             diagnostics_interval=diagnostics_interval,
+            demos=demos,
+            bc_coef=bc_coef,
             overlap=overlap,
             precision=precision,
             compile_mode=compile_mode,

@@ -231,6 +231,7 @@ class Experiment(ExperimentManager):
         """Restore the replay buffer of a checkpoint, too, and draw other scenes than at the beginning of the run."""
         with quiet_n_steps():
             model = super()._load_pretrained_agent(hyperparams, env)
+        model.policy.set_training_mode(True)  # a policy that this algorithm cannot train says so now
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
         buffer = getattr(model, "replay_buffer", None)

@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -117,6 +118,7 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
             # If set, SB3 would end the episode that a second learn() cuts off
             self.optimize_memory_usage = False
         self._check_buffer()
+        self.policy.is_trained_here = True
         self._acceleration = AcceleratedUpdates(self.policy, self.precision, self.compile_mode)
         self._augmentation = Augmentation(self.policy, self.augmentation_pad)
         self._metrics = RunningMeans()
@@ -249,10 +251,37 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
                 )
                 raise ValueError("the {} of the replay buffer in the file is {}, and this model's is {}".format(*differs))
 
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, tensors = super()._get_torch_save_params()
-        own = [] if self.policy.objective_optimizer is None else ["policy.objective_optimizer"]
-        return [*state_dicts, *own], tensors
+    def get_parameters(self) -> dict[str, Any]:
+        """
+        :return: SB3's names and state dicts. The state of an objective's own optimizer is a part of the critic's optimizer, so
+            that SB3's class finds the names that it expects
+        """
+        parameters = super().get_parameters()
+        if self.policy.objective_optimizer is not None:
+            parameters["critic.optimizer"]["objective"] = self.policy.objective_optimizer.state_dict()
+        return parameters
+
+    def set_parameters(
+        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        :param load_path_or_dict: What ``get_parameters()`` returned, or the path of a model
+        :param exact_match: Whether all parameters must be there
+        :param device: PyTorch device
+        :raises ValueError: If parameters are missing, or of other names
+        """
+        if isinstance(load_path_or_dict, dict):
+            parameters: dict[str, Any] = load_path_or_dict
+        else:
+            parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
+        super().set_parameters(parameters, exact_match, device)
+        if self.policy.objective_optimizer is None:
+            return
+        state = parameters.get("critic.optimizer", {}).get("objective")
+        if state is not None:
+            self.policy.objective_optimizer.load_state_dict(state)
+        elif exact_match:
+            raise ValueError("the state of the objective's optimizer is missing in the one of critic.optimizer")
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_metrics", "_augmentation", "_acceleration", "demo_buffer"]

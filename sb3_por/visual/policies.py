@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+from sb3_por.common.errors import UserError
 from sb3_por.objectives.base import Objective
 from sb3_por.visual.encoders import CombinedEncoder, ConvEncoder, Encoder, VectorEncoder, make_projection
 
@@ -211,6 +212,8 @@ class VisualPolicy(BasePolicy):
     actor_kwargs: dict[str, Any]
     critic_kwargs: dict[str, Any]
     share_features_extractor: bool
+    #: Whether the algorithm that owns the policy trains its objective: set by ``VisualAlgorithm``
+    is_trained_here = False
 
     def __init__(
         self,
@@ -319,6 +322,17 @@ class VisualPolicy(BasePolicy):
         return preprocess_obs(part, space, normalize_images=self.normalize_images)
 
     def set_training_mode(self, mode: bool) -> None:
+        """
+        :param mode: True before an update, False before an action
+        :raises UserError: If another algorithm is about to update the policy: SB3's would train it without its objective and
+            without augmentations. It may predict
+        """
+        if mode and not self.is_trained_here:
+            named = "no objective" if self.objective_class is None else f"the objective {self.objective_class.__name__}"
+            raise UserError(
+                f"a {type(self).__name__} of sb3_por with {named} can predict in a class of Stable-Baselines3, not learn: "
+                "use a class of sb3_por, such as the one that saved the model"
+            )
         super().set_training_mode(mode)
         if self.objective is not None:
             self.objective.train(mode)

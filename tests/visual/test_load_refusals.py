@@ -2,13 +2,17 @@
 
 import re
 
+import numpy as np
 import pytest
 import torch as th
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_envs import DotEnv
 
-from sb3_por import SACCURL, SACPOR, TQCPOR, SACDrQ, VisualSAC
+from sb3_por import SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualSAC, VisualTQC
+from sb3_por.common.errors import UserError
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
@@ -26,6 +30,24 @@ def test_a_model_is_refused_by_the_class_of_another_method(cls, tmp_path):
     make_model(SACDrQ).save(tmp_path / "drq.zip")
     with pytest.raises(ValueError, match="was trained with no objective"):
         SACPOR.load(tmp_path / "drq.zip", device="cpu")
+
+
+@pytest.mark.parametrize("cls", [SACPOR, SACDrQ, SACCURL, SACSPR, VisualSAC, TQCPOR, VisualTQC])
+def test_a_class_of_sb3_predicts_with_a_model_of_ours_and_does_not_train_it(cls, tmp_path):
+    model = make_model(cls, learning_starts=10).learn(20)
+    model.save(tmp_path / "ours.zip")
+    parent = TQC if issubclass(cls, TQC) else SAC
+    loaded = parent.load(tmp_path / "ours.zip", env=DotEnv(size=20), device="cpu")
+    frames = np.random.default_rng(0).integers(0, 256, (3, *model.observation_space.shape), np.uint8)
+    assert np.array_equal(loaded.predict(frames, deterministic=True)[0], model.predict(frames, deterministic=True)[0])
+    before = {name: value.clone() for name, value in loaded.policy.state_dict().items()}
+    for learning_starts in (0, 5):
+        loaded.learning_starts = learning_starts
+        with pytest.raises(UserError, match="can predict in a class of Stable-Baselines3, not learn"):
+            loaded.learn(20)
+    assert all(th.equal(value, before[name]) for name, value in loaded.policy.state_dict().items())
+    with pytest.raises(UserError, match="not learn"):
+        parent(type(model.policy), DotEnv(size=20), buffer_size=50, learning_starts=5, policy_kwargs=POLICY).learn(10)
 
 
 def test_a_method_can_start_from_the_encoder_of_another():

@@ -74,15 +74,22 @@ def _evaluate(args: argparse.Namespace) -> None:
 
 def _enjoy_arguments(parser: argparse.ArgumentParser) -> None:
     _model_arguments(parser)
-    parser.add_argument("-o", "--output", required=True, help="the video: .gif or .mp4")
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("-o", "--output", help="the video: .gif or .mp4")
+    where.add_argument("--human", action="store_true", help="show the episodes in a window instead; pip install '.[human]'")
     parser.add_argument("-n", "--n-episodes", type=int, default=1, help="held-out episodes (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--size", type=int, default=480, help="height and width in pixels (default 480)")
 
 
 def _enjoy(args: argparse.Namespace) -> None:
+    from sb3_por.evaluation.show import show_episodes
     from sb3_por.evaluation.video import check_video, record_video
 
+    if args.human:
+        model, environment = _load(args)
+        print(show_episodes(model, args.env, args.n_episodes, args.seed, args.size, **environment))
+        return
     check_video(args.output)
     model, environment = _load(args)
     print(record_video(model, args.env, args.output, args.n_episodes, args.seed, args.size, **environment))
@@ -242,7 +249,7 @@ COMMANDS = {
         run=_evaluate,
     ),
     "enjoy": Command(
-        help="record a video of a model",
+        help="record a video of a model, or show it in a window",
         example="--model logs/sac_por/PourWater-v0_1 --env PourWater-v0 -o pour.gif",
         add_arguments=_enjoy_arguments,
         run=_enjoy,

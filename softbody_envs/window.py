@@ -1,9 +1,27 @@
 """The window of ``render_mode="human"``."""
 
 import os
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+
+
+def check_display(pygame: Any) -> None:
+    """
+    Check that a window of pygame can be seen. Without a display, SDL draws into memory and reports nothing.
+
+    :param pygame: The module
+    :raises gymnasium.error.Error: If there is no display, unless ``SDL_VIDEODRIVER`` asks for none
+    """
+    try:
+        pygame.display.init()
+        seen = pygame.display.get_driver() not in ("offscreen", "dummy") or "SDL_VIDEODRIVER" in os.environ
+    except pygame.error as error:
+        raise gym.error.Error(f'render_mode="human" cannot open a window: {error}') from error
+    if not seen:
+        pygame.display.quit()
+        raise gym.error.Error('render_mode="human" needs a display; render_mode="rgb_array" works without one')
 
 
 class Window:
@@ -12,6 +30,7 @@ class Window:
 
     :param fps: frames per second
     :raises gymnasium.error.DependencyNotInstalled: if pygame is missing
+    :raises gymnasium.error.Error: if there is no display
     """
 
     def __init__(self, fps: float) -> None:
@@ -20,6 +39,7 @@ class Window:
             import pygame
         except ImportError as error:
             raise gym.error.DependencyNotInstalled('render_mode="human" needs pygame: pip install ".[human]"') from error
+        check_display(pygame)
         self._pygame = pygame
         self._clock = pygame.time.Clock()
         self._fps = fps

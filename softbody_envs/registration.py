@@ -55,14 +55,31 @@ def _find_spec(env_id: str) -> EnvSpec:
     return gym.spec(get_env_id(namespace, name, version))
 
 
+#: id -> its specification and the class of the environment that it makes
+_made_classes: dict[str, tuple[EnvSpec, type]] = {}
+
+
 def _made_class(spec: EnvSpec) -> type:
+    """Class of the environment that a specification makes, found once."""
+    known, made = _made_classes.get(spec.id, (None, object))
+    if known is not spec:  # an id can be registered again
+        made = _find_class(spec)
+        _made_classes[spec.id] = spec, made
+    return made
+
+
+def _find_class(spec: EnvSpec) -> type:
     """Class of the environment that an entry point makes. Functions and wrappers are called to find out."""
     creator: Any = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
     if isinstance(creator, type) and not issubclass(creator, gym.Wrapper):
         return creator
     try:
         env = creator(**spec.kwargs)
-    except TypeError:  # it needs arguments that the spec does not have
+    except Exception as error:  # of a user's code, which may need arguments that the specification does not have
+        gym.logger.warn(
+            f"{spec.id} is not taken for a task of softbody_envs: its entry point cannot be called without arguments "
+            f"({type(error).__name__}: {error}). If it makes one, register it with kwargs= or as a class."
+        )
         return object
     env.close()
     return type(env.unwrapped)

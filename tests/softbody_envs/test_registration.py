@@ -2,6 +2,7 @@
 
 import functools
 import sys
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -39,6 +40,10 @@ def needs_more(env, **kwargs):
     return env
 
 
+def needs_a_file(path="missing.txt", **kwargs):
+    return open(path)
+
+
 VARIANTS = {
     "subclass": (OwnReward, FallingBallEnv),
     "subclass with other defaults": (OwnDefaults, StraightenRopeEnv),
@@ -52,6 +57,7 @@ OTHERS = {
     "missing module": "no_such_module:Env",
     "missing class": "softbody_envs.tasks.falling_ball:NoSuchEnv",
     "function that needs arguments": needs_more,
+    "function that fails without arguments": needs_a_file,
     "nothing": None,
 }
 
@@ -92,6 +98,35 @@ def test_a_variant_is_a_task_with_the_scenes_of_its_parent(register, entry_point
     ours.close()
 
 
+def test_a_function_is_called_once_to_find_out_until_its_id_is_registered_again(register):
+    calls = []
+
+    def make(**kwargs):
+        calls.append(kwargs)
+        return FallingBallEnv(**kwargs)
+
+    env_id = register(make, kwargs={"obs_type": "state"})
+    for _ in range(3):
+        assert task_class(env_id) is FallingBallEnv
+        assert task_class(env_id.removesuffix("-v0")) is FallingBallEnv
+    assert calls == [{"obs_type": "state"}]
+    del gym.registry[env_id]
+    gym.register(env_id, NoTask)
+    assert task_class(env_id) is None
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("entry_point", [needs_more, needs_a_file])
+def test_a_function_that_cannot_be_called_is_named_once(register, entry_point):
+    env_id = register(entry_point)
+    with pytest.warns(UserWarning, match="Own-v0 is not taken for a task .* register it with kwargs= or as a class"):
+        assert task_class(env_id) is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert task_class(env_id) is None
+
+
+@pytest.mark.filterwarnings("ignore:.*is not taken for a task")
 @pytest.mark.parametrize("entry_point", OTHERS.values(), ids=OTHERS)
 def test_everything_else_is_no_task(register, entry_point):
     env_id = register(entry_point)

@@ -138,10 +138,12 @@ def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
     """
     file = model_file(path)
     folder = file.parent / env_id.rpartition(":")[2]
-    if (folder / HYPERPARAMETERS).is_file():
-        made_of: TrainingEnvironment | None = TrainingEnvironment.of_settings(
-            folder.name, read_settings(folder / HYPERPARAMETERS)
-        )
+    settings = read_settings(folder / HYPERPARAMETERS)
+    if settings:
+        # The RL Zoo has the arguments of the command line in its other file alone
+        given = read_settings(folder / ARGUMENTS).get("env_kwargs") or {}
+        settings["env_kwargs"] = {**(settings.get("env_kwargs") or {}), **given}
+        made_of: TrainingEnvironment | None = TrainingEnvironment.of_settings(folder.name, settings)
     else:
         made_of = TrainingEnvironment.of_data(read_data(file))
         if made_of is None:

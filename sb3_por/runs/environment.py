@@ -1,5 +1,6 @@
 """Parts of a run's training environment, as its settings name them, and their import."""
 
+import ast
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -46,9 +47,11 @@ class TrainingEnvironment:
         :param env_id: Gymnasium id
         :param settings: Hyperparameters of a run
         :return: The part of them that concerns the environment
+        :raises UserError: If ``normalize`` is not understood
         """
         names = [field.name for field in fields(cls) if field.name != "env_id"]
-        return cls(env_id, **{name: settings.get(name) for name in names})
+        parts = {name: settings.get(name) for name in names}
+        return cls(env_id, **parts | {"normalize": read_normalization(settings.get("normalize"))})
 
     @classmethod
     def of_model(cls, model: Any) -> "TrainingEnvironment | None":
@@ -88,6 +91,39 @@ class TrainingEnvironment:
         :param model: An SB3 model
         """
         setattr(model, ATTRIBUTE, dump_settings(asdict(self)))
+
+
+def read_normalization(value: Any) -> bool | dict[str, Any]:
+    """
+    Read the setting ``normalize``. The RL Zoo's files have Python as text there, ``"dict(norm_obs=True)"``: literals are read,
+    and nothing is run.
+
+    :param value: Whether to use ``VecNormalize``, or its arguments, or a text of either
+    :return: The same without text
+    :raises UserError: If it is neither
+    """
+    parsed = value
+    if isinstance(value, str):
+        try:
+            parsed = ast.literal_eval(_DictCalls().visit(ast.parse(value.strip(), mode="eval")))
+        except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+            parsed = value
+    if parsed is None or isinstance(parsed, bool):
+        return bool(parsed)
+    if isinstance(parsed, dict) and all(isinstance(key, str) for key in parsed):
+        return parsed or True
+    raise UserError(f"normalize must be True, False or arguments of VecNormalize, {{'norm_obs': False}}, got {value!r}")
+
+
+class _DictCalls(ast.NodeTransformer):
+    """Replaces ``dict(a=1)`` by ``{"a": 1}``."""
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        if not (isinstance(node.func, ast.Name) and node.func.id == "dict") or node.args:
+            return node
+        keys = [None if keyword.arg is None else ast.Constant(keyword.arg) for keyword in node.keywords]
+        return ast.copy_location(ast.Dict(list(keys), [keyword.value for keyword in node.keywords]), node)
 
 
 def import_wrappers(spec: Any) -> Callable[[Any], Any] | None:

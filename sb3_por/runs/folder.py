@@ -59,7 +59,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads the output of ``_Dumper``; classes become a ``ClassName``."""
+    """Reads the output of ``_Dumper`` and of the RL Zoo; classes become a ``ClassName``."""
 
 
 def _represent_class(dumper: yaml.SafeDumper, value: type) -> yaml.Node:
@@ -70,10 +70,17 @@ def _construct_tuple(loader: yaml.SafeLoader, node: Any) -> tuple[Any, ...]:
     return tuple(loader.construct_sequence(node, deep=True))
 
 
+def _construct_ordered_dict(loader: yaml.SafeLoader, node: Any) -> dict[str, Any]:
+    """The RL Zoo writes one of pairs."""
+    (pairs,) = loader.construct_sequence(node, deep=True)
+    return dict(pairs)
+
+
 def _construct_class(loader: yaml.SafeLoader, name: str, _: yaml.Node) -> ClassName:
     return ClassName(name)
 
 
+_ORDERED_DICT = "tag:yaml.org,2002:python/object/apply:collections.OrderedDict"
 _TUPLE, _NAME = "tag:yaml.org,2002:python/tuple", "tag:yaml.org,2002:python/name:"
 _Dumper.add_multi_representer(object, lambda dumper, value: dumper.represent_str(repr(value)))
 _Dumper.add_multi_representer(dict, lambda dumper, value: dumper.represent_dict(value))
@@ -81,6 +88,7 @@ _Dumper.add_representer(tuple, lambda dumper, value: dumper.represent_sequence(_
 _Dumper.add_multi_representer(type, _represent_class)
 _Dumper.add_representer(ClassName, lambda dumper, value: dumper.represent_scalar(f"{_NAME}{value}", ""))
 _Loader.add_constructor(_TUPLE, _construct_tuple)
+_Loader.add_constructor(_ORDERED_DICT, _construct_ordered_dict)
 _Loader.add_multi_constructor(_NAME, _construct_class)
 
 
@@ -94,7 +102,7 @@ def dump_settings(settings: dict[str, Any]) -> str:
 
 def parse_settings(text: str) -> dict[str, Any]:
     """
-    :param text: YAML that ``dump_settings`` wrote
+    :param text: YAML that ``dump_settings`` or the RL Zoo wrote
     :return: Names and values; a class is a ``ClassName``
     :raises ValueError: If it is not YAML of names and values, or needs other Python objects
     """

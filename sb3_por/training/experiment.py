@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from filelock import FileLock, Timeout
 from gymnasium import spaces
@@ -35,7 +34,7 @@ from sb3_por.runs.checkpoints import (
     restore_buffer,
     restore_monitors,
 )
-from sb3_por.runs.environment import TrainingEnvironment
+from sb3_por.runs.environment import TrainingEnvironment, read_normalization
 from sb3_por.runs.folder import (
     ARGUMENTS,
     BEST_STATISTICS,
@@ -117,8 +116,8 @@ class Experiment(ExperimentManager):
             saved = import_names(read_settings(self._resumed_run / self.env_name / HYPERPARAMETERS)) | changes
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
-        if isinstance(saved.get("normalize"), str):  # the zoo's files have Python as text there
-            hyperparams["normalize"] = saved["normalize"] = eval(saved["normalize"])
+        if "normalize" in saved:
+            hyperparams["normalize"] = saved["normalize"] = read_normalization(saved["normalize"])
         held_out = evaluation_kwargs(self.env_name.gym_id)
         self.eval_env_kwargs = {**whole_episodes(self.env_kwargs), **held_out, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved
@@ -165,7 +164,7 @@ class Experiment(ExperimentManager):
             experiment = super().setup_experiment()
             if experiment is not None and isinstance(experiment[0], VisualAlgorithm) and experiment[0].demos:
                 experiment[0].load_demos(experiment[0].demos)
-        except (AssertionError, TypeError, ValueError, RuntimeError, gym.error.Error) as error:
+        except Exception as error:  # of any package, user's module or setting
             if self._folder_made:
                 shutil.rmtree(self.save_path, ignore_errors=True)
             if isinstance(error, UserError) or self.verbose > 1:

@@ -7,7 +7,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import SAC
+import yaml
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
@@ -47,6 +48,32 @@ def test_the_same_scores_from_folder_path_and_model(run, tmp_path):
         assert expected.returns[0] == pytest.approx(file["results"][0, 0])
     bare = evaluate(SAC.load(alone), "Pendulum-v1", n_episodes=2, env_wrapper=lambda env: env)
     assert bare != expected
+
+
+def test_a_run_of_the_rl_zoo_is_evaluated_in_its_environment(tmp_path):
+    conf = tmp_path / "conf.yml"
+    settings = {
+        "n_timesteps": 40,
+        "policy": "MlpPolicy",
+        "n_steps": 20,
+        "batch_size": 20,
+        "normalize": "dict(norm_obs=True, norm_reward=False)",
+        "env_wrapper": [{"softbody_envs.wrappers.ActionRepeat": {"repeat": 5, "scale": 0.5}}],
+        "frame_stack": 2,
+    }
+    conf.write_text(yaml.safe_dump({"Pendulum-v1": settings}))
+    flags = ["--algo", "ppo", "--env", "Pendulum-v1", "--env-kwargs", "g:1.0", "--seed", "1", "--eval-freq", "-1"]
+    command = [sys.executable, "-m", "rl_zoo3.train", *flags, "-conf", str(conf), "-f", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    model = tmp_path / "ppo" / "Pendulum-v1_1" / "Pendulum-v1.zip"
+    scores = evaluate(model, "Pendulum-v1", n_episodes=2)
+    statistics = model.with_suffix("") / "vecnormalize.pkl"
+    repeat = {"env_wrapper": lambda env: ActionRepeat(env, 5, 0.5)}
+    given = {"env_kwargs": {"g": 1.0}, "vec_normalize": str(statistics), **repeat}
+    assert scores == evaluate(PPO.load(model), "Pendulum-v1", n_episodes=2, **given)
+    others = ({"env_kwargs": {"g": 10.0}}, {"env_wrapper": lambda env: env})
+    assert all(scores != evaluate(model, "Pendulum-v1", n_episodes=2, **other) for other in others)
 
 
 def test_a_loaded_model_that_is_saved_again_still_knows_its_environment(run, tmp_path):

@@ -4,9 +4,10 @@ import sys
 from collections import OrderedDict
 
 import pytest
+import yaml
 
 from sb3_por.common.errors import UserError
-from sb3_por.runs.environment import TrainingEnvironment, import_wrappers
+from sb3_por.runs.environment import TrainingEnvironment, import_wrappers, read_normalization
 from sb3_por.runs.folder import dump_settings, import_names, parse_settings, read_settings, run_arguments
 
 SETTINGS = {"k": 3, "frames": (1, 2), "wrappers": [{"a.B": {"kind": OrderedDict, "nested": ({"of": dict},)}}], "none": None}
@@ -44,3 +45,52 @@ def test_reading_runs_nothing(strangers_module, tmp_path):
 def test_a_class_that_does_not_exist_is_named():
     with pytest.raises(UserError, match=r"cannot import no_such\.Thing"):
         import_names(parse_settings("x: !!python/name:no_such.Thing ''"))
+
+
+def test_settings_of_the_rl_zoo_are_read():
+    settings = {"env_wrapper": [{"a.B": {"shape": (1, 2)}}], "env_kwargs": OrderedDict(size=3), "gamma": 0.9}
+    assert parse_settings(yaml.dump(OrderedDict(settings))) == settings
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (True, True),
+        ("True", True),
+        ("False", False),
+        (None, False),
+        ({"norm_obs": False}, {"norm_obs": False}),
+        ("{'norm_obs': False, 'clip_obs': -1.5}", {"norm_obs": False, "clip_obs": -1.5}),
+        (" dict(norm_obs=True, norm_obs_keys=['a', 'b'])", {"norm_obs": True, "norm_obs_keys": ["a", "b"]}),
+        ("dict()", True),
+        ({}, True),
+    ],
+)
+def test_normalization_is_read_as_the_zoo_writes_it(value, expected):
+    assert read_normalization(value) == expected
+    assert TrainingEnvironment.of_settings("E-v0", {"normalize": value}).normalize == expected
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "open('ran', 'w')",
+        "dict(norm_obs=open('ran', 'w'))",
+        "dict(**open('ran', 'w').__dict__)",
+        "dict([('norm_obs', True)])",
+        "[open('ran', 'w')]",
+        "norm_obs",
+        "dict(",
+        "",
+        "9" * 5000,
+        "(" * 500,
+        3,
+        {3: 4},
+        ["norm_obs"],
+    ],
+)
+def test_other_normalization_is_refused_and_nothing_is_run(value, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="normalize must be True, False or arguments of VecNormalize"):
+        read_normalization(value)
+    assert not list(tmp_path.iterdir())

@@ -21,6 +21,7 @@ from sb3_por.common.files import atomic_write
 from sb3_por.evaluation.loading import load_model
 from sb3_por.runs import checkpoints
 from sb3_por.runs.checkpoints import latest_checkpoint, read_rng_state, remove_checkpoints, restore_buffer, save_checkpoint
+from sb3_por.runs.folder import is_finished
 from sb3_por.training.zoo import main
 
 ROOT = Path(__file__).parents[2]
@@ -302,3 +303,44 @@ def test_a_finished_run_is_extended_in_its_folder(keeps_buffer, tmp_path, capsys
     assert load_model(run / "Pendulum-v1.zip").num_timesteps == 90
     with np.load(run / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == [60, 90] and (np.diff(file["wall_clock_s"]) > 0).all()
+
+
+def test_an_extension_that_is_interrupted_is_resumed_again(tmp_path, monkeypatch):
+    """Killed once after a checkpoint of its own and once before the next one, it ends like one that nobody has killed."""
+    often = ["--save-freq", "50", "--eval-freq", "40", "--eval-episodes", "1", "--save-replay-buffer"]
+    runs = []
+    for name in ("whole", "killed"):
+        assert main([*FLAGS, "-n", "60", *often, "-f", str(tmp_path / name), *SMALL]) == 0
+        runs.append(tmp_path / name / "sac" / "Pendulum-v1_1")
+    whole, killed = runs
+    assert main(["--resume", str(whole), "-n", "230"]) == 0
+
+    def die_at(step):
+        def die(callback):
+            if callback.num_timesteps == step:
+                raise RuntimeError("killed")
+            return True
+
+        monkeypatch.setattr("sb3_por.training.experiment.CheckpointCallback._on_step", die)
+
+    for step, more, checkpoint in ((130, ["-n", "230"], "step_100"), (145, [], "step_100"), (180, [], "step_150")):
+        die_at(step)
+        with pytest.raises(RuntimeError, match="killed"):
+            main(["--resume", str(killed), *more])
+        assert latest_checkpoint(killed).name == checkpoint
+        assert not is_finished(killed, "Pendulum-v1"), "the model of 60 steps is not the last one"
+        monkeypatch.undo()
+    assert main(["--resume", str(killed)]) == 0
+    assert latest_checkpoint(killed) is None and is_finished(killed, "Pendulum-v1")
+    for run in runs:
+        model = load_model(run / "Pendulum-v1.zip")
+        assert (model.num_timesteps, model._n_updates, model._total_timesteps) == (230, 230 - 50, 230)
+        with np.load(run / "evaluations.npz") as file:
+            assert file["timesteps"].tolist() == [40, 60, 80, 120, 160, 200, 230]
+            assert (np.diff(file["wall_clock_s"]) > 0).all()
+        with open(run / "replay_buffer.pkl", "rb") as file:
+            assert pickle.load(file).pos == 230
+        lengths = [int(row.split(",")[1]) for row in (run / "0.monitor.csv").read_text().splitlines()[2:]]
+        assert sum(lengths) <= 230
+    names = [{path.name for path in run.iterdir()} for run in runs]
+    assert names[0] == names[1]

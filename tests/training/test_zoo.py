@@ -329,6 +329,9 @@ def test_a_model_of_another_method_is_refused_in_one_line(tmp_path, capsys):
     assert main([*flags, "-params", "policy:MlpPolicy"]) == 2
     shown = capsys.readouterr().err.splitlines()[-1]
     assert "SACDrQ has no objective" in shown and "PartialOrder" in shown and "load_encoder()" in shown
+    flags[1] = "sac"  # can predict with it, and is refused before its random steps
+    assert main([*flags, "-params", "policy:MlpPolicy"]) == 2
+    assert "the objective PartialOrder can predict in a class of Stable-Baselines3, not learn" in capsys.readouterr().err
     assert not list(tmp_path.glob("*/Pendulum-v1_*"))
 
 

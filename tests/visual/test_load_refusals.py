@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_envs import DotEnv
 
-from sb3_por import SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualSAC, VisualTQC
+from sb3_por import ALGORITHMS, SACCURL, SACPOR, TQCPOR, SACDrQ, VisualSAC, VisualTQC
 from sb3_por.common.errors import UserError
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
@@ -32,7 +32,7 @@ def test_a_model_is_refused_by_the_class_of_another_method(cls, tmp_path):
         SACPOR.load(tmp_path / "drq.zip", device="cpu")
 
 
-@pytest.mark.parametrize("cls", [SACPOR, SACDrQ, SACCURL, SACSPR, VisualSAC, TQCPOR, VisualTQC])
+@pytest.mark.parametrize("cls", [*ALGORITHMS.values(), VisualSAC, VisualTQC])
 def test_a_class_of_sb3_predicts_with_a_model_of_ours_and_does_not_train_it(cls, tmp_path):
     model = make_model(cls, learning_starts=10).learn(20)
     model.save(tmp_path / "ours.zip")

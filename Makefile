@@ -1,6 +1,7 @@
 # make train   set up and train POR on pouring: make train ARGS="-n 2500 --seed 1"
 # make test    set up and run the tests:        make test ARGS="-k plots"
 # make demo    a small run from training to a curve and a GIF, within 10 minutes on two CPU cores
+# make docs    build the documentation site into site/
 # make lint, make format, make type, make bench
 
 VENV := .venv
@@ -14,7 +15,7 @@ PYTHON ?= $(shell for p in python3.11 python3.10 python3.13 python3.12 python3 p
 
 export MPLBACKEND := Agg
 
-.PHONY: train test demo lint format type bench
+.PHONY: train test demo docs lint format type bench
 
 train: $(VENV)/.installed-test
 	$(BIN)/python train.py --algo sac_por --env PourWater-v0 $(ARGS)
@@ -33,6 +34,11 @@ demo: $(VENV)/.installed-test
 	$(BIN)/python -m sb3_por enjoy --model $(DEMO_RUN)/best_model.zip --env PourWater-v0 -o $(DEMO)/pour_water.gif
 	@printf 'model  %s\ncurve  %s\nGIF    %s\n' $(DEMO_RUN)/best_model.zip $(DEMO)/curve.png $(DEMO)/pour_water.gif
 
+# The variable silences an advertisement of the theme's successor.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet $(ARGS)
+	@echo site/index.html
+
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/black --check .
@@ -48,7 +54,8 @@ bench: $(VENV)/.installed-test
 	for benchmark in benchmarks/*.py; do $(BIN)/python $$benchmark $(ARGS) || exit; done
 
 # One stamp for each set of extras: installed again only when setup.cfg or constraints.txt changed.
-$(VENV)/.installed-test: EXTRAS := test
+$(VENV)/.installed-test: EXTRAS := test,docs
+$(VENV)/.installed-docs: EXTRAS := docs
 $(VENV)/.installed-dev: EXTRAS := test,dev
 $(VENV)/.installed-%: setup.cfg constraints.txt | $(BIN)/pip
 	$(BIN)/python -m pip install -q -c constraints.txt -e '.[$(EXTRAS)]'

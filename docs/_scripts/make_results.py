@@ -1,5 +1,5 @@
 """
-Fill in the tables of results.md, full_speed.md, trials.md and por.md from results/, and draw their figures.
+Fill in the tables of the pages in PAGES from results/, and draw their figures.
 
     python docs/_scripts/make_results.py              tables only
     python docs/_scripts/make_results.py --figures    and the figures
@@ -10,6 +10,7 @@ A table stands between `<!-- table: NAME -->` and `<!-- end -->`; ``TABLES`` map
 import argparse
 import re
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,17 @@ from sb3_por.analysis.scores import read_scores
 
 DOCS = Path(__file__).parents[1]
 RESULTS = DOCS.parent / "results"
-PAGES = ("results.md", "lab/full_speed.md", "lab/trials.md", "por.md")
+#: Algorithms with a page, a curve and scores.
+ALGOS = ("sac_por", "sac_drq", "sac_curl", "sac_spr", "sac")
+PAGES = (
+    "results.md",
+    "lab/full_speed.md",
+    "lab/trials.md",
+    "por.md",
+    "algorithms/tqc_por.md",
+    "algorithms/sac_mrq.md",
+    *(f"algorithms/{algo}.md" for algo in ALGOS),
+)
 METRIC = "normalized_performance"
 #: POR's rivals from pixels in the paper.
 RIVALS = ("sac_drq", "sac_curl", "sac_spr")
@@ -235,6 +246,36 @@ def leak() -> str:
     return markdown(head, rows)
 
 
+def scores_of(algo: str) -> str:
+    """Tabulate what one algorithm has reached in the suites that compare algorithms."""
+    rows = []
+    for suite in ("main", "full_speed", "fold"):
+        scores = read_scores([RESULTS / suite / "scores.csv"])
+        means = plot(scores, "aggregates")[0].table.query("statistic == 'mean'").set_index("algo")
+        if algo not in means.index:
+            continue
+        mean = means.loc[algo]
+        runs = scores.query("algo == @algo and step == @mean.step").sort_values("seed")
+        rows.append(
+            (
+                f"`{runs['env'].iloc[0]}`",
+                f"`suites/{suite}.yml`",
+                str(mean["step"]),
+                with_interval(mean["value"], mean["low"], mean["high"]),
+                ", ".join(f"{score:.2f}" for score in runs[METRIC]),
+                f"{runs['wall_clock_s'].mean() / 60:.0f}",
+            )
+        )
+    return markdown(("task", "suite", "agent steps", "mean", "each seed", "minutes"), rows)
+
+
+def metrics_of(objective: str) -> str:
+    """Repeat an objective's rows of the page of metrics."""
+    page = (DOCS / "metrics.md").read_text()
+    rows = re.findall(rf"^\| `train/(?:{objective}_|encoder_grad_norm_{objective}`).*$", page, re.MULTILINE)
+    return "\n".join(["| metric | meaning | usual | worry if |", "| --- | --- | --- | --- |", *rows])
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "comparison": lambda: comparison("main"),
     "rivals": rivals,
@@ -253,6 +294,11 @@ TABLES: dict[str, Callable[[], str]] = {
     "diagnosis": lambda: diagnosis("main"),
     "diagnosis_full_speed": lambda: diagnosis("full_speed"),
     "leak": leak,
+    "metrics_por": lambda: metrics_of("por"),
+    "metrics_curl": lambda: metrics_of("curl"),
+    "metrics_spr": lambda: metrics_of("spr"),
+    "metrics_mrq": lambda: metrics_of("mrq"),
+    **{f"scores_{algo}": partial(scores_of, algo) for algo in ALGOS},
 }
 
 
@@ -273,6 +319,10 @@ def draw() -> None:
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     for suite in ("main", "full_speed"):
         plot_order(read_order([RESULTS / suite / "order.csv"])[0])[0].save(RESULTS / suite / "order.png")
+    scores = read_scores([RESULTS / "main" / "scores.csv"])
+    for algo in ALGOS:
+        with_plain = scores[scores["algo"].isin([algo, "por_lambda_0"])]
+        plot(with_plain, "tasks")[0].save(DOCS / "algorithms" / f"{algo}.png")
 
 
 def main() -> None:

@@ -14,8 +14,7 @@ from sb3_por.visual.sac import VisualSAC
 class SACDrQ(VisualSAC):
     """
     DrQ (https://arxiv.org/abs/2004.13649): SAC from pixels with [K, M] random shifts and nothing else. Losses are averaged
-        over
-    the M augmentations; DrQ sums them, which Adam does not notice. One ``tau`` moves all targets.
+    over the M augmentations; DrQ sums them, which Adam does not notice. One ``tau`` moves all targets.
 
     Arguments are SB3's in SB3's order, then those of ``VisualSAC`` by keyword.
 

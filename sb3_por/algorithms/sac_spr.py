@@ -15,8 +15,8 @@ from sb3_por.visual.sac import VisualSAC
 
 class SACSPR(VisualSAC):
     """
-    SPR (https://arxiv.org/abs/2007.05929): SAC from pixels with a self-predictive objective, which has an optimizer of its
-        own.
+    SPR (https://arxiv.org/abs/2007.05929): SAC from pixels with a self-predictive objective, which has an optimizer of
+    its own.
 
     Arguments are SB3's in SB3's order, then those of SPR and of ``VisualSAC`` by keyword.
 

@@ -23,17 +23,17 @@ COLORS = {
     "sac_drq": "#D55E00",
     "sac_curl": "#009E73",
     "sac_spr": "#CC79A7",
-    "sac_mrq": "#882255",
     "tqc_por": "#56B4E9",
     "sac": "#000000",
     "por_lambda_0": "#E69F00",
     "por_paper": "#8C510A",
+    "sac_mrq": "#882255",
 }
 #: Colours of all other names: Tol's "muted" scheme, without those close to one above.
 OTHER_COLORS = ("#332288", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#AA4499")
 #: Line styles and markers keep curves apart in grey print.
-STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), (0, (8, 2)))
-MARKERS = ("o", "s", "^", "D", "v", "p", "h", "X")
+STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), (0, (8, 2)), (0, (4, 1, 1, 1)))
+MARKERS = ("o", "s", "^", "D", "v", "p", "h", "X", "P")
 FORMATS = (".png", ".pdf", ".svg")
 #: Approximate number of markers on a curve.
 N_MARKERS = 12
@@ -54,7 +54,7 @@ def looks(algos: Iterable[str]) -> dict[str, Look]:
     Look up how to draw algorithms.
 
     :param algos: names of algorithms or labels
-    :return: name -> look. Names in ``COLORS`` have fixed looks. Of other names 64 are told apart: a hash of the name chooses
+    :return: name -> look. Names in ``COLORS`` have fixed looks. Of other names 63 are told apart: a hash of the name chooses
         the look; where two names of one figure choose the same, the later in the alphabet takes the next free one.
     """
     names = set(algos)
@@ -91,6 +91,7 @@ def style() -> Iterator[None]:
 
 
 def one_panel() -> tuple[Figure, Axes]:
+    """Make a figure with a single panel."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     return figure, figure.add_subplot()
 
@@ -150,6 +151,7 @@ def name_rows(axes: Axes, names: list[str]) -> None:
 
 
 def steps_axis(axes: Axes) -> None:
+    """Label an x axis as environment steps, with few ticks in units such as 20k."""
     axes.set_xlabel("environment steps")
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -26,7 +26,7 @@ class Model(Protocol):
     action_space: spaces.Space
 
     def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
-        """See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.predict`."""
+        """See ``predict`` of ``stable_baselines3.common.base_class.BaseAlgorithm``."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class Pool(ABC):
             self.states |= {run: "interrupted" for run in active}
 
     def progress(self, run: Run) -> tuple[int, float | None]:
-        """As :func:`sb3_por.runs.folder.progress`; the files of what does not run are read once."""
+        """As :func:`sb3_por.runs.facts.progress`; the files of what does not run are read once."""
         key = run, self.states[run]
         if key not in self._progress or self.states[run] == "running":
             self._progress[key] = progress(run.run_folder)

@@ -73,7 +73,8 @@ def test_every_import_is_a_declared_dependency(options):
 def test_constraints_pin_what_is_declared_within_its_range(options):
     pinned = requirements((ROOT / "constraints.txt").read_text())
     extras = options["options.extras_require"]
-    declared = requirements("\n".join([options["options"]["install_requires"], extras["test"], extras["dev"]]))
+    texts = (options["options"]["install_requires"], *(extras[name] for name in ("test", "dev", "docs")))
+    declared = requirements("\n".join(texts))
     assert set(declared) <= set(pinned)
     for name, requirement in declared.items():
         (pin,) = pinned[name].specifier
@@ -187,17 +188,20 @@ def test_make_installs_once(tmp_path):
     # Without what a make that runs these tests tells the makes below it.
     env = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
     fresh = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True).stdout
-    assert "pip install -q -c constraints.txt -e '.[test]'" in fresh
+    assert "pip install -q -c constraints.txt -e '.[test,docs]'" in fresh
     stamp.touch()
     again = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True).stdout
     assert again.strip() == f"{tmp_path}/venv/bin/python train.py --algo sac_por --env PourWater-v0 -n 5"
 
 
 def test_every_task_and_algorithm_is_listed():
-    pages = ROOT / "README.md", ROOT / "docs" / "usage.md"
-    readme, usage = (set(re.findall(r"^\| `([^`]+)` \|", page.read_text(), re.MULTILINE)) for page in pages)
-    assert readme == {*ALGORITHMS, "sac"}
-    assert set(ENV_IDS) <= usage
+    """In a table, with a page of its own."""
+    docs = ROOT / "docs"
+    for table, folder, names in (("algorithms.md", "algorithms", {*ALGORITHMS, "sac"}), ("tasks/README.md", "tasks", ENV_IDS)):
+        listed = re.findall(r"^\| \[`([^`]+)`\]\((\S+)\) \|", (docs / table).read_text(), re.MULTILINE)
+        assert {name for name, _ in listed} == set(names)
+        for name, page in listed:
+            assert (docs / table).parent / page == docs / folder / f"{name}.md" and (docs / folder / f"{name}.md").is_file()
 
 
 def test_the_readme_begins_with_the_commands():

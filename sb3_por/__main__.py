@@ -96,6 +96,42 @@ def _enjoy(args: argparse.Namespace) -> None:
     print(args.output)
 
 
+def _record_arguments(parser: argparse.ArgumentParser) -> None:
+    from sb3_por.training.arguments import Settings
+
+    parser.add_argument("--model", required=True, help="expert, a .zip, or a run folder (its best model)")
+    parser.add_argument("--env", required=True, help="environment id")
+    algo = (
+        "record in the environment that the settings of this algorithm make (default: that of the model; sac_por's for expert)"
+    )
+    parser.add_argument("--algo", help=algo)
+    parser.add_argument("-conf", "--conf-file", help="file of these settings, as for train.py")
+    changes = "changes to these settings, as for train.py"
+    parser.add_argument("-params", "--hyperparams", nargs="+", default={}, action=Settings, metavar="KEY:VALUE", help=changes)
+    kwargs = "arguments of the environment, as for train.py"
+    parser.add_argument("--env-kwargs", nargs="+", default={}, action=Settings, metavar="KEY:VALUE", help=kwargs)
+    parser.add_argument("-o", "--output", required=True, help="folder of the new dataset, in Minari's format")
+    parser.add_argument("-n", "--n-episodes", type=int, default=50, help="episodes of training scenes (default 50)")
+    parser.add_argument("--seed", type=int, default=0, help="chooses the scenes (default 0)")
+
+
+def _record(args: argparse.Namespace) -> None:
+    import softbody_envs  # noqa: F401  (registers its ids)
+    from sb3_por.evaluation.loading import find_environment
+    from sb3_por.training.record import EXPERT, record, settings_environment
+
+    if args.seed < 0:
+        raise UserError(f"--seed must not be negative, got {args.seed}")
+    env_id = find_environment(args.env, None if args.model == EXPERT else args.model)
+    algo = args.algo or ("sac_por" if args.model == EXPERT else None)
+    if algo is None and (args.conf_file or args.hyperparams or args.env_kwargs):
+        raise UserError("-conf, -params and --env-kwargs are about the settings of an algorithm: give --algo, too")
+    changes = args.conf_file, args.hyperparams, args.env_kwargs
+    made_of = None if algo is None else settings_environment(algo, env_id, *changes)
+    print(record(args.model, env_id, args.output, args.n_episodes, args.seed, made_of))
+    print(args.output)
+
+
 def _plot_arguments(parser: argparse.ArgumentParser) -> None:
     from sb3_por.analysis.names import FIGURES, METRICS, ORDER
 
@@ -253,6 +289,12 @@ COMMANDS = {
         example="--model logs/sac_por/PourWater-v0_1 --env PourWater-v0 -o pour.gif",
         add_arguments=_enjoy_arguments,
         run=_enjoy,
+    ),
+    "record": Command(
+        help="record demonstrations in the training environment, for train.py --demos",
+        example="--model expert --env PourWater-v0 -n 50 -o demos",
+        add_arguments=_record_arguments,
+        run=_record,
     ),
     "plot": Command(
         help="draw learning curves and comparisons with 95 %% stratified bootstrap intervals",

@@ -5,6 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
+from softbody_envs.experts.pace import FULL_SPEED, Pace
 from softbody_envs.registration import ENV_IDS, task_class
 
 
@@ -29,17 +30,18 @@ def has_expert(env_id: str) -> bool:
     return task is not None and task.expert is not None
 
 
-def make_expert(env_id: str) -> Expert:
+def make_expert(env_id: str, pace: Pace = FULL_SPEED) -> Expert:
     """
     Make the expert of a task.
 
     :param env_id: id of a task that has an expert, or of a subclass of such a task
+    :param pace: what becomes of the expert's actions; it is asked once per action
     :raises ValueError: if there is no expert for this id
     """
     task = task_class(env_id)
     if task is None or task.expert is None:
         raise ValueError(f"no expert for {env_id!r}; there is one for {', '.join(EXPERT_IDS)}")
-    return resolve_name(task.expert)()
+    return resolve_name(task.expert)(pace)
 
 
 #: Ids in ``ENV_IDS`` that have an expert.

@@ -5,6 +5,7 @@ from collections.abc import Generator
 
 import numpy as np
 
+from softbody_envs.experts.pace import FULL_SPEED, Pace
 from softbody_envs.sim.pickers import REACH
 
 #: Height of a picker's centre above a corner when it grasps it, m, and while it travels to it, m.
@@ -13,6 +14,8 @@ TRAVEL_HEIGHT = 0.10
 #: Control steps in which the edge is carried, and its largest height, as a fraction of half the length of the cloth.
 CARRY_STEPS = 28
 ARCH = 0.95
+#: Fewest actions in which the edge is carried: their chords must draw an arc.
+FEWEST_CARRIES = 5
 #: Distance at which a position counts as reached, m.
 NEAR = 0.01
 
@@ -23,7 +26,11 @@ Script = Generator[np.ndarray, np.ndarray, None]
 class ScriptedExpert(ABC):
     """An expert that follows a script: one action after the other."""
 
-    def __init__(self) -> None:
+    #: Largest move of a picker along each axis in one control step at full speed, m.
+    reach = REACH
+
+    def __init__(self, pace: Pace = FULL_SPEED) -> None:
+        self.pace = pace
         self._script: Script | None = None
 
     def reset(self) -> None:
@@ -37,6 +44,20 @@ class ScriptedExpert(ABC):
             return self._script.send(state)
         self._script = self.script(state)
         return next(self._script)
+
+    def go(self, goals: np.ndarray, state: np.ndarray, pick: bool) -> np.ndarray:
+        """Action that moves the pickers to their goals, m, ``(2, 3)``, or as far toward them as they come on each axis."""
+        move = np.clip((goals - pickers(state)) / (self.reach * self.pace.stride), -1.0, 1.0)
+        return np.column_stack([move, np.full(2, 1.0 if pick or self.pace.keep_hold else -1.0)]).ravel()
+
+    def leave(self, state: np.ndarray) -> Script:
+        """Release, rise, and stay there; only stay if the hands cannot open."""
+        goals = pickers(state)
+        state = yield self.go(goals, state, pick=False)
+        if not self.pace.keep_hold:
+            goals = goals + (0.0, 0.0, TRAVEL_HEIGHT)
+        while True:
+            state = yield self.go(goals, state, pick=False)
 
     @abstractmethod
     def script(self, state: np.ndarray) -> Script:
@@ -58,21 +79,6 @@ def holding(state: np.ndarray) -> np.ndarray:
     return state[18:20] > 0.5
 
 
-def go(goals: np.ndarray, state: np.ndarray, pick: bool, reach: float = REACH) -> np.ndarray:
-    """Action that moves the pickers to their goals, m, ``(2, 3)``, or toward them by at most ``reach`` m per axis."""
-    move = np.clip((goals - pickers(state)) / reach, -1.0, 1.0)
-    return np.column_stack([move, np.full(2, 1.0 if pick else -1.0)]).ravel()
-
-
-def leave(state: np.ndarray) -> Script:
-    """Release, rise, and stay there."""
-    goals = pickers(state)
-    state = yield go(goals, state, pick=False)
-    goals = goals + (0.0, 0.0, TRAVEL_HEIGHT)
-    while True:
-        state = yield go(goals, state, pick=False)
-
-
 class FoldClothExpert(ScriptedExpert):
     """Folds the cloth along its middle."""
 
@@ -81,15 +87,15 @@ class FoldClothExpert(ScriptedExpert):
         for height in (TRAVEL_HEIGHT, GRASP_HEIGHT):
             while True:
                 goals = corners(state)[:2] + (0.0, 0.0, height)
-                if np.abs(goals - pickers(state)).max() < NEAR:
+                if np.abs(goals - pickers(state)).max() < NEAR or holding(state).all():
                     break
-                state = yield go(goals, state, pick=False)
+                state = yield self.go(goals, state, pick=False)
         while not holding(state).all():
-            state = yield go(pickers(state), state, pick=True)
+            state = yield self.go(pickers(state), state, pick=True)
 
         start, way = pickers(state), corners(state)[2:] - corners(state)[:2]
         radius = np.linalg.norm(way, axis=1, keepdims=True) / 2
-        for angle in np.pi * np.linspace(0, 1, CARRY_STEPS + 1)[1:]:
+        for angle in np.pi * np.linspace(0, 1, self.pace.actions(CARRY_STEPS, FEWEST_CARRIES) + 1)[1:]:
             rise = ARCH * radius * np.sin(angle) * (0.0, 0.0, 1.0)
-            state = yield go(start + way * (1 - np.cos(angle)) / 2 + rise, state, pick=True)
-        yield from leave(state)
+            state = yield self.go(start + way * (1 - np.cos(angle)) / 2 + rise, state, pick=True)
+        yield from self.leave(state)

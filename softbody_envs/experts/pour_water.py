@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from softbody_envs.experts.pace import FULL_SPEED, Pace
 from softbody_envs.sim.cups import WALL
 from softbody_envs.tasks.pour_water import MARGIN, REACH
 from softbody_envs.tasks.pour_water_amount import PourWaterAmountEnv
@@ -15,12 +16,16 @@ GAP = 0.01
 #: Tilt per control step, rad, and tilt at which the cup is empty, rad.
 TILT_RATE = 0.06
 LAST_TILT = 2.4
+#: Largest tilt of one action, rad. The cup turns and moves along a chord of its way, which must not enter that zone.
+LARGEST_TILT = 0.4
 #: Tilt per control step near the end of a measured pour, rad.
 SLOWEST_TILT_RATE = 0.015
 #: Control steps for which the present flow continues after the cup begins to tilt back.
 FORESIGHT = 4
 #: Fraction of the water that leaves the cup while it tilts back, in addition to the flow.
 RESERVE = 0.04
+#: Largest tilt of one action near the end of a measured pour, rad.
+FINE_TILT = 0.04
 #: Fractions of the water that have left a slowly tilted cup of any size, and the tilts at which they have, rad. The spheres
 #: form a lattice, which gives way at a certain slope.
 FRACTIONS_LEFT = (0.0, 0.2, 0.5, 0.8, 1.0)
@@ -31,6 +36,11 @@ HEADROOM = 0.25
 
 class PourWaterExpert:
     """Pours all the water."""
+
+    def __init__(self, pace: Pace = FULL_SPEED) -> None:
+        self._pace = pace
+        self._reach = REACH * pace.stride
+        self.reset()
 
     def reset(self) -> None:
         """Do nothing: the expert has no memory."""
@@ -56,18 +66,15 @@ class PourWaterExpert:
         if np.abs(offset).max() < 0.02:
             tilt_change = np.clip(tilt + self.tilt_rate(state), 0.0, LAST_TILT) - tilt
             offset = place(tilt + tilt_change) - position
-        return np.clip(np.array([*offset, tilt_change]) / REACH, -1.0, 1.0)
+        return np.clip(np.array([*offset, tilt_change]) / self._reach, -1.0, 1.0)
 
     def tilt_rate(self, state: np.ndarray) -> float:
-        """Tilt in this control step, rad."""
-        return TILT_RATE
+        """Tilt of the next action, rad."""
+        return min(self._pace.repeat * TILT_RATE, LARGEST_TILT)
 
 
 class PourWaterAmountExpert(PourWaterExpert):
     """Tilts quickly until shortly before the goal, then in small steps, and back as soon as enough water has left the cup."""
-
-    def __init__(self) -> None:
-        self.reset()
 
     def reset(self) -> None:
         """Forget how much water has left the cup."""
@@ -76,13 +83,14 @@ class PourWaterAmountExpert(PourWaterExpert):
     def tilt_rate(self, state: np.ndarray) -> float:
         seen = named(state)
         left, goal = 1.0 - seen["fraction in cup"], seen["target fraction"]
-        flow, self._left = left - self._left, left
+        flow, self._left = (left - self._left) / self._pace.repeat, left
         if left + FORESIGHT * flow >= goal - RESERVE:
-            return -REACH[2]
+            return -self._reach[2]
         if flow > 0.0:
             return 0.0
-        expected_tilt = np.interp(goal, FRACTIONS_LEFT, TILTS)
-        return TILT_RATE if seen["cup tilt"] < expected_tilt - HEADROOM else SLOWEST_TILT_RATE
+        expected_tilt, tilt = np.interp(goal, FRACTIONS_LEFT, TILTS), seen["cup tilt"]
+        slowest = min(self._pace.repeat * SLOWEST_TILT_RATE, FINE_TILT)
+        return float(np.clip(expected_tilt - HEADROOM - tilt, slowest, super().tilt_rate(state)))
 
 
 def named(state: np.ndarray) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from softbody_envs.experts.pace import FULL_SPEED, Pace
 from softbody_envs.sim.pickers import REACH
 from softbody_envs.sim.rope import LENGTH
 from softbody_envs.tasks.straighten_rope import LOW
@@ -15,7 +16,8 @@ APART = 0.01
 class StraightenRopeExpert:
     """Sends each picker to the closer end. Once both hold, they move apart along the line through the ends."""
 
-    def __init__(self) -> None:
+    def __init__(self, pace: Pace = FULL_SPEED) -> None:
+        self._reach = REACH * pace.stride
         self.reset()
 
     def reset(self) -> None:
@@ -35,7 +37,7 @@ class StraightenRopeExpert:
         picks = np.where(near, 1.0, -1.0)
         if (holds & near).all():
             offsets = self._targets(ends) - ends
-        return np.concatenate([np.clip(offsets / REACH, -1.0, 1.0), picks[:, None]], axis=1).ravel()
+        return np.concatenate([np.clip(offsets / self._reach, -1.0, 1.0), picks[:, None]], axis=1).ravel()
 
     @staticmethod
     def _targets(ends: np.ndarray) -> np.ndarray:

@@ -1,0 +1,190 @@
+"""Record demonstrations: a policy plays training scenes in the environment that an algorithm's settings make."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import yaml
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_por.common.errors import UserError, one_line
+from sb3_por.demonstrations.dataset import RecordedEpisode, check_new, write_demonstrations
+from sb3_por.evaluation.environment import make_evaluation_env
+from sb3_por.evaluation.episodes import Episode, Evaluation, FixedEpisodes, Model, run_episodes
+from sb3_por.evaluation.loading import resolve
+from sb3_por.runs.environment import TrainingEnvironment, import_wrappers
+from sb3_por.runs.folder import import_names
+from sb3_por.training.arguments import hyperparameter_file
+from softbody_envs.experts import make_expert
+from softbody_envs.experts.pace import Pace
+from softbody_envs.registration import task_class
+from softbody_envs.variations import SPLITS
+
+#: Name of the scripted expert among models.
+EXPERT = "expert"
+
+
+class Recorder(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
+    """
+    Keep every episode that ends in ``episodes``; one that a reset cuts off is lost.
+
+    :param env: The environment
+    """
+
+    def __init__(self, env: gym.Env[Any, np.ndarray]) -> None:
+        super().__init__(env)
+        self.episodes: list[RecordedEpisode] = []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See ``gymnasium.Env.reset``."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._seed = seed
+        self._observations, self._actions, self._rewards = [observation], list[np.ndarray](), list[float]()
+        return observation, info
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See ``gymnasium.Env.step``."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._observations.append(observation)
+        self._actions.append(np.array(action))
+        self._rewards.append(float(reward))
+        if terminated or truncated:
+            observations = _stack(self._observations)
+            actions, rewards = np.stack(self._actions), np.array(self._rewards)
+            self.episodes.append(RecordedEpisode(observations, actions, rewards, terminated, self._seed))
+        return observation, float(reward), terminated, truncated, info
+
+
+class AttachedExpert:
+    """
+    Scripted expert that reads the state of an environment, whatever is observed there.
+
+    :param env_id: Gymnasium id of a task with an expert
+    :param env: The environment, inside its wrappers
+    :raises UserError: If the task has no expert
+    """
+
+    def __init__(self, env_id: str, env: gym.Env[Any, np.ndarray]) -> None:
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+        self._env: Any = env.unwrapped
+        try:
+            self._expert = make_expert(env_id, Pace.of(env))
+        except ValueError as error:
+            raise UserError(one_line(error)) from error
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """Return the expert's action, shape ``(1, action_dim)``."""
+        if episode_start is None or episode_start[0]:
+            self._expert.reset()
+        return self._expert.act(self._env.state())[None].astype(np.float32), state
+
+
+def settings_environment(
+    algo: str,
+    env_id: str,
+    conf_file: str | None = None,
+    changes: dict[str, Any] | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+) -> TrainingEnvironment:
+    """
+    :param algo: Name of an algorithm
+    :param env_id: Gymnasium id
+    :param conf_file: Settings in the RL Zoo's format; the file that ``train.py`` would choose by default
+    :param changes: Changes to the settings
+    :param env_kwargs: Changes to the arguments of the environment
+    :return: The environment that ``train.py`` would train in
+    :raises UserError: If there are no settings
+    """
+    file = Path(conf_file) if conf_file else hyperparameter_file(algo, env_id)
+    try:
+        settings = yaml.safe_load(file.read_text())
+        settings = {**(settings[env_id] if env_id in settings else settings["default"]), **(changes or {})}
+    except (OSError, yaml.YAMLError, TypeError, KeyError) as error:
+        raise UserError(f"cannot read settings for {env_id} from {file}: {one_line(error)}") from error
+    settings["env_kwargs"] = {**(settings.get("env_kwargs") or {}), **(env_kwargs or {})}
+    return TrainingEnvironment.of_settings(env_id, settings)
+
+
+def record(
+    model: Model | str | Path,
+    env_id: str,
+    path: str | Path,
+    n_episodes: int,
+    seed: int = 0,
+    made_of: TrainingEnvironment | None = None,
+) -> Evaluation:
+    """
+    Record episodes of training scenes, never of held-out ones, as a Minari dataset. What is recorded is what the environment
+    inside its wrappers gives and takes, before frames are stacked and observations normalized.
+
+    :param model: ``"expert"`` for the task's scripted expert, a run folder, the path of a model, or a model
+    :param env_id: Gymnasium id
+    :param path: Folder of the new dataset
+    :param n_episodes: Number of episodes, of different scenes as long as there are any left
+    :param seed: Chooses the scenes; episode k is reset with ``seed + k``
+    :param made_of: Parts of the environment; by default those that the model was trained in, and for the expert those of
+        ``sac_por``
+    :return: The scores of the episodes
+    :raises UserError: If the model or the environment cannot be made, or the folder cannot be written
+    """
+    if n_episodes < 1:
+        raise UserError(f"a recording needs at least 1 episode, got {n_episodes}")
+    check_new(path)
+    loaded, environment = (None, {}) if model == EXPERT else resolve(model, env_id)
+    if made_of is None and loaded is None:
+        made_of = settings_environment("sac_por", env_id)
+    if made_of is not None:
+        environment["env_kwargs"] = import_names(made_of.env_kwargs or {})
+        environment["env_wrapper"] = import_wrappers(made_of.env_wrapper)
+    environment["env_kwargs"] = environment["env_kwargs"] | ({"split": "train"} if task_class(env_id) is not None else {})
+    wrap = environment["env_wrapper"] or (lambda env: env)
+    try:
+        env = wrap(gym.make(env_id, **environment["env_kwargs"]))
+    except (TypeError, ValueError, gym.error.Error) as error:
+        raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
+    spec = env.spec  # without what records and monitors
+
+    recorder = Recorder(Monitor(env))
+    if loaded is None:
+        player: Any = AttachedExpert(env_id, env)
+        venv: VecEnv = DummyVecEnv([lambda: FixedEpisodes(recorder)])
+    else:
+        player = loaded
+        venv = make_evaluation_env(loaded, env_id, **environment | {"env_wrapper": lambda _: recorder})
+    try:
+        evaluation = run_episodes(player, venv, training_episodes(env_id, n_episodes, seed))
+    finally:
+        venv.close()
+    write_demonstrations(
+        path,
+        recorder.episodes,
+        recorder.observation_space,
+        recorder.action_space,
+        spec,
+        algorithm_name=model if isinstance(model, str) else type(loaded).__name__,
+        description=f"{env_id}: {evaluation}",
+    )
+    return evaluation
+
+
+def training_episodes(env_id: str, n_episodes: int, seed: int) -> list[Episode]:
+    """
+    :param env_id: Gymnasium id
+    :param n_episodes: Number of episodes
+    :param seed: Chooses the scenes
+    :return: Episodes in training scenes drawn without replacement, as long as there are any left
+    """
+    train, has_variations = SPLITS["train"], task_class(env_id) is not None
+    order = np.random.default_rng(seed).permutation(train)
+    return [Episode(k, seed + k, int(order[k % len(order)]) if has_variations else None) for k in range(n_episodes)]
+
+
+def _stack(observations: list[Any]) -> Any:
+    """One array with an axis for time, or a dict of them."""
+    if isinstance(observations[0], dict):
+        return {key: np.stack([one[key] for one in observations]) for key in observations[0]}
+    return np.stack(observations)

@@ -1,0 +1,189 @@
+"""Recording, and datasets that others have written."""
+
+import sys
+import types
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import SAC
+from toy_envs import DotEnv
+
+import softbody_envs  # noqa: F401  (registers its ids)
+from sb3_por import SACPOR, VisualSAC
+from sb3_por.__main__ import main
+from sb3_por.common.errors import UserError
+from sb3_por.demonstrations.dataset import Demonstrations, RecordedEpisode, write_demonstrations
+from sb3_por.training.record import record
+from softbody_envs.variations import SPLITS
+from softbody_envs.wrappers import ActionRepeat
+
+minari = pytest.importorskip("minari", reason="pip install 'sb3-por[demos]'")
+
+
+@pytest.fixture(scope="module")
+def poured(tmp_path_factory):
+    """Two episodes of the expert as the settings make them, and what was printed."""
+    path = tmp_path_factory.mktemp("recorded") / "demos"
+    return path, record("expert", "PourWater-v0", path, 2)
+
+
+def test_the_expert_is_recorded_in_the_environment_of_the_settings(poured):
+    path, evaluation = poured
+    assert np.mean(evaluation.normalized_performance) > 0.8
+    assert all(variation in SPLITS["train"] for variation in evaluation.variations) and len(set(evaluation.variations)) == 2
+    dataset = minari.MinariDataset(path)
+    assert dataset.total_episodes == 2 and dataset.observation_space.shape == (64, 64, 3)
+    env = dataset.recover_environment()
+    assert isinstance(env, ActionRepeat) and (env.repeat, env.scale) == (10, 0.7)
+    for episode, variation, total in zip(dataset, evaluation.variations, evaluation.returns, strict=True):
+        assert len(episode.actions) == 10 and episode.truncations.tolist() == [False] * 9 + [True]
+        assert not episode.terminations.any() and np.sum(episode.rewards) == pytest.approx(total, abs=1e-5)
+        observation, _ = env.reset(options={"variation": variation})
+        for t, action in enumerate(episode.actions):
+            assert np.array_equal(episode.observations[t], observation), "stored without loss"
+            observation = env.step(action)[0]
+        assert np.array_equal(episode.observations[-1], observation)
+    env.close()
+
+
+def test_a_recording_is_learned_from_in_the_same_environment(poured):
+    env = ActionRepeat(gym.make("PourWater-v0", image_size=64), 10, 0.7)
+    model = SACPOR("CnnPolicy", env, buffer_size=50, demos=str(poured[0]), learning_starts=3, batch_size=4).learn(4)
+    assert model.demo_buffer.size() == 20 and model.demo_buffer.timeouts.sum() == 2
+
+
+def test_record_from_the_shell(tmp_path, capsys):
+    path = tmp_path / "new" / "demos"
+    flags = ["--model", "expert", "--env", "StraightenRope-v0", "-n", "1", "-o", str(path)]
+    assert main(["record", *flags, "--algo", "sac_drq", "--env-kwargs", "obs_type:dict", "image_size:32"]) == 0
+    line, where = capsys.readouterr().out.splitlines()
+    assert "success 100%" in line and "length 30 (1 episode)" in line and where == str(path)
+    (episode,) = Demonstrations(path).episodes()
+    assert episode.observations["image"].shape == (31, 32, 32, 3) and episode.observations["state"].shape[0] == 31
+    assert main(["record", *flags]) == 2
+    assert "exists; give a new folder" in capsys.readouterr().err
+
+
+def test_a_trained_model_is_recorded_in_its_environment(tmp_path, capsys):
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, seed=0).save(tmp_path / "model.zip")
+    flags = ["--model", str(tmp_path / "model.zip"), "--env", "Pendulum-v1", "-n", "2", "-o", str(tmp_path / "demos")]
+    assert main(["record", *flags]) == 0
+    first, second = Demonstrations(tmp_path / "demos").episodes()
+    assert first.observations.shape == (201, 3) and not np.array_equal(first.observations, second.observations)
+    model = SAC.load(tmp_path / "model.zip")
+    predicted = model.predict(first.observations[:-1], deterministic=True)[0]
+    assert np.allclose(predicted, first.actions, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--model", "expert", "--env", "Pendulum-v1"], "no expert for 'Pendulum-v1'"),
+        (["--model", "expert", "--env", "FoldClot-v0"], "did you mean FoldCloth-v0?"),
+        (["--model", "nothing.zip", "--env", "Pendulum-v1"], "there is no model nothing.zip"),
+        (["--model", "expert", "--env", "PourWater-v0", "-n", "0"], "at least 1 episode"),
+        (["--model", "expert", "--env", "PourWater-v0", "--env-kwargs", "image_size:-1"], "cannot make PourWater-v0"),
+        (["--model", "expert", "--env", "PourWater-v0", "-conf", "none.yml"], "cannot read settings for PourWater-v0"),
+        (["--model", "RUN", "--env", "Pendulum-v1", "--env-kwargs", "g:9.0"], "give --algo, too"),
+    ],
+)
+def test_what_cannot_be_recorded_is_said_in_one_line(arguments, message, tmp_path, capsys):
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "model.zip")
+    arguments = [str(tmp_path / "model.zip") if argument == "RUN" else argument for argument in arguments]
+    assert main(["record", *arguments, "-o", str(tmp_path / "demos")]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "demos").exists()
+
+
+def tree_map(function, tree, *others):
+    """``jax.tree_util.tree_map`` for dicts and leaves, which is all that Minari's collector needs of it."""
+    if isinstance(tree, dict):
+        return {key: tree_map(function, value, *(other[key] for other in others)) for key, value in tree.items()}
+    return function(tree, *others)
+
+
+@pytest.fixture
+def collected(tmp_path, monkeypatch):
+    """A dataset that Minari's own collector has written, in Minari's own folder."""
+    tree_util = types.ModuleType("jax.tree_util")
+    tree_util.tree_map = tree_map
+    monkeypatch.setitem(sys.modules, "jax", types.ModuleType("jax"))
+    monkeypatch.setitem(sys.modules, "jax.tree_util", tree_util)
+    sys.modules["jax"].tree_util = tree_util
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    env = minari.DataCollector(DotEnv(size=32, horizon=7))
+    env.action_space.seed(0)
+    for seed in range(3):
+        env.reset(seed=seed)
+        for _ in range(7 if seed < 2 else 4):  # the last one is cut off
+            env.step(env.action_space.sample())
+    env.create_dataset("dots/random-v0", author="a", author_email="b", code_permalink="c", algorithm_name="d", description="e")
+    return tmp_path / "dots" / "random-v0"
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_dataset_of_minaris_collector_is_learned_from(collected):
+    model = VisualSAC("CnnPolicy", DotEnv(size=32, horizon=7), buffer_size=50, learning_starts=3, batch_size=4)
+    for path in (collected, collected / "data"):
+        model.load_demos(path)
+        assert model.demo_buffer.size() == 18
+        assert np.flatnonzero(model.demo_buffer.timeouts[:, 0]).tolist() == [6, 13, 17]
+    env = DotEnv(size=32, horizon=7)
+    stored = model.demo_buffer.observations[0, 0].transpose(1, 2, 0).astype(int)
+    assert np.abs(stored - env.reset(seed=0)[0]).mean() < 10, "the collector compresses images with loss"
+    model.learn(5)
+
+
+def change(path, name, value=None):
+    """Replace an array of the first episode, or remove it."""
+    import h5py
+
+    with h5py.File(path / "main_data.hdf5", "a") as file:
+        del file["episode_0"][name]
+        if value is not None:
+            file["episode_0"][name] = value
+
+
+@pytest.mark.parametrize(
+    "damage, message",
+    [
+        (lambda path: change(path, "actions"), "cannot read episode 0"),
+        (lambda path: change(path, "actions", np.zeros((3, 1))), r"actions of shape \(3, 1\)"),
+        (lambda path: change(path, "rewards", np.full(4, np.nan)), "not finite"),
+        (lambda path: change(path, "observations", np.zeros((4, 3))), "4 steps need 5 observations"),
+        (lambda path: (path / "main_data.hdf5").unlink(), "cannot read the Minari dataset"),
+        (lambda path: (path / "main_data.hdf5").write_bytes(b"no HDF5"), "cannot read episode 0"),
+        (lambda path: (path / "metadata.json").write_text("{"), "cannot read the Minari dataset"),
+        (lambda path: (path / "metadata.json").unlink(), "no metadata.json of a Minari dataset"),
+    ],
+)
+def test_a_damaged_dataset_is_refused(damage, message, tmp_path):
+    env, path = gym.make("Pendulum-v1"), tmp_path / "demos"
+    episode = RecordedEpisode(np.zeros((5, 3), np.float32), np.zeros((4, 1), np.float32), np.zeros(4), False)
+    write_demonstrations(path, [episode], env.observation_space, env.action_space)
+    damage(path)
+    with pytest.raises(UserError, match=message):
+        VisualSAC("MlpPolicy", env, buffer_size=10).load_demos(path)
+
+
+def test_a_failed_recording_leaves_nothing(tmp_path):
+    def episodes():
+        yield RecordedEpisode(np.zeros((2, 3), np.float32), np.zeros((1, 1), np.float32), np.zeros(1), False)
+        raise RuntimeError("killed here")
+
+    env = gym.make("Pendulum-v1")
+    with pytest.raises(RuntimeError, match="killed here"):
+        write_demonstrations(tmp_path / "demos", episodes(), env.observation_space, env.action_space)
+    assert not list(Path(tmp_path).iterdir())
+    write_demonstrations(tmp_path / "none", [], env.observation_space, env.action_space)
+    with pytest.raises(UserError, match="has no episodes"):
+        Demonstrations(tmp_path / "none")
+
+
+def test_without_minari_there_is_a_line_on_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "minari", None)
+    with pytest.raises(UserError, match=r"pip install 'sb3-por\[demos\]'"):
+        Demonstrations(tmp_path)

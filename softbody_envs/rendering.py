@@ -89,10 +89,17 @@ class Renderer:
         )
         if isinstance(rgba, tuple):  # a pybullet built without numpy; these two are ten times faster than np.asarray
             rgba = np.frombuffer(bytearray(rgba), np.uint8)
-            depth = np.frombuffer(struct.pack(f"{size * size}f", *depth), np.float32)
-        bodies = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4)[:, :, :3]
+            depth = np.frombuffer(struct.Struct(f"{size * size}f").pack(*depth), np.float32)
+        bodies = np.asarray(rgba, dtype=np.uint8).reshape(size, size, 4)
         depth = np.asarray(depth, dtype=np.float32).reshape(size, size)
-        return np.where(depth[:, :, None] < NOTHING, bodies, backdrop(camera, size, world.floor)), depth
+        # Four channels in one number are chosen together, in half the time of three.
+        chosen = np.where(depth < NOTHING, _as_numbers(bodies), _as_numbers(backdrop(camera, size, world.floor)))
+        return np.ascontiguousarray(chosen.view(np.uint8).reshape(size, size, 4)[:, :, :3]), depth
+
+
+def _as_numbers(rgba: np.ndarray) -> np.ndarray:
+    """Pixels of an RGBA image, uint8 ``(height, width, 4)``, as uint32 ``(height, width)``."""
+    return rgba.view(np.uint32)[:, :, 0]
 
 
 @lru_cache(maxsize=32)
@@ -100,11 +107,11 @@ def backdrop(camera: Camera, size: int, floor: Floor | None) -> np.ndarray:
     """
     Return the image of a scene without bodies.
 
-    :return: read-only RGB image, uint8 ``(size, size, 3)``
+    :return: read-only RGBA image, uint8 ``(size, size, 4)``
     """
-    image = np.full((size, size, 3), SKY_COLOR, np.uint8)
+    image = np.full((size, size, 4), SKY_COLOR, np.uint8)
     if floor is not None:
-        image[on_floor(camera, size, floor)[1]] = FLOOR_COLOR
+        image[on_floor(camera, size, floor)[1], :3] = FLOOR_COLOR
     image.flags.writeable = False
     return image
 

@@ -126,13 +126,15 @@ def start_process(run: Run, threads: int) -> subprocess.Popen:
         shutil.rmtree(run.run_folder, ignore_errors=True)
     run.folder.mkdir(parents=True, exist_ok=True)
     of_libraries = {name: str(threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    # Otherwise an error stands in the log before what was printed earlier and kept in a buffer.
+    in_order = {"PYTHONUNBUFFERED": "1"}
     with open(run.log, "ab") as log:
         return subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,
-            env=os.environ | of_libraries,
+            env=os.environ | of_libraries | in_order,
             start_new_session=True,
             preexec_fn=_die_with_parent,
         )

@@ -329,7 +329,8 @@ overrides: {td3: {colour: blue}}
 """
 
 
-def test_failures_are_named_and_what_is_finished_is_not_done_again(suite_file, tmp_path, capfd):
+def test_failures_are_named_and_what_is_finished_is_not_done_again(suite_file, tmp_path, capfd, monkeypatch):
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
     path, root = suite_file(SMALL_SUITE), tmp_path / "runs"
     assert main(["suite", str(path), "--root", str(root)]) == 1
     shown = capfd.readouterr()

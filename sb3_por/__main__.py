@@ -202,7 +202,7 @@ def _diagnose_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _diagnose(args: argparse.Namespace) -> None:
     from sb3_por.analysis.diagnostics import check_order, diagnose, diagnose_runs
-    from sb3_por.common.files import check_output
+    from sb3_por.common.files import atomic_write, check_output
 
     if args.csv:
         check_output(args.csv, (".csv",))
@@ -211,7 +211,8 @@ def _diagnose(args: argparse.Namespace) -> None:
     if args.paths:
         table = diagnose_runs(args.paths, args.n_episodes, args.seed, args.fresh_head)
         if args.csv:
-            table.to_csv(args.csv, index=False, float_format="%.5g")
+            with atomic_write(args.csv) as path:
+                table.to_csv(path, index=False, float_format="%.5g")
         print(table.to_json(orient="records", indent=2) if args.json else table.round(3).to_string(index=False))
         return
     model, environment = _load(args)

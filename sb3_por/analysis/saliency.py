@@ -119,5 +119,6 @@ def draw_saliency(
         np.ascontiguousarray(frames[step][-3:].transpose(1, 2, 0)), saliency_map(model, frames[step - k], frames[step])
     )
     with atomic_write(path) as temporary:
-        cv2.imwrite(str(temporary), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        # OpenCV's own writing does not tell of a full disk.
+        temporary.write_bytes(cv2.imencode(path.suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
     return step

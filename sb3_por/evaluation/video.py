@@ -92,11 +92,27 @@ def write_video(path: str | Path, frames: list[Any], fps: float) -> None:
     :param path: ``.gif`` or ``.mp4``
     :param frames: uint8 images, ``(height, width, 3)``, at least one
     :param fps: frames per second
+    :raises DiskError: if the disk is full, read-only or out of reach; a video that was there before stays
     """
     path = check_video(path)
     with atomic_write(path) as temporary:
         if path.suffix.lower() == ".gif":
-            imageio.mimwrite(temporary, frames, duration=1000 / fps, loop=0)
+            # In memory first: on a full disk Pillow's writer would fail a second time when it is collected.
+            temporary.write_bytes(imageio.mimwrite("<bytes>", frames, format="gif", duration=1000 / fps, loop=0))
         else:
             # H.264 needs even sizes: other frames are scaled up to the next multiple of 2.
             imageio.mimwrite(temporary, frames, fps=fps, macro_block_size=2)
+            _check_complete(temporary)
+
+
+def _check_complete(path: Path) -> None:
+    """
+    ffmpeg runs in a process of its own, and imageio does not look at how it ended: on a full disk, with half a video.
+
+    :raises OSError: If the video cannot be read
+    """
+    try:
+        with imageio.get_reader(path) as reader:
+            reader.get_next_data()
+    except (OSError, IndexError) as error:
+        raise OSError(f"cannot write the video: {one_line(error)}") from error

@@ -7,6 +7,7 @@ import pickle
 import shutil
 import uuid
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_por.common.files import atomic_write
+from sb3_por.common.files import DiskError, atomic_write, disk_errors
 from sb3_por.common.random_state import get_rng_state
 from sb3_por.runs.folder import CHECKPOINTS, MONITORS, STATISTICS
 
 #: Model in the folder of a checkpoint
 MODEL = "model.zip"
+#: Folder of the blocks of replay buffers, beside the checkpoints
+BLOCKS = "blocks"
 #: Bytes of a replay buffer that are stored together; only blocks that changed are written again.
 BLOCK_SIZE = 4 * 2**20
 
@@ -37,11 +40,28 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: float
     :param env_id: names the folder of ``VecNormalize`` statistics, as in the zoo
     :param seconds: Wall-clock time of the run so far
     :return: The new folder
+    :raises DiskError: If the disk is full, read-only or out of reach; the checkpoint before stays
     """
     root = run / CHECKPOINTS
     final = root / f"step_{model.num_timesteps}"
     if final.exists():
         return final
+    before = latest_checkpoint(run)
+    try:
+        with disk_errors(final):
+            _write_checkpoint(model, run, env_id, seconds)
+    except DiskError:
+        # Make room again: the run may continue.
+        with suppress(OSError):
+            _remove_all_but(before, root)
+        raise
+    _remove_all_but(final, root)
+    return final
+
+
+def _write_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: float) -> None:
+    """See :func:`save_checkpoint`."""
+    root = run / CHECKPOINTS
     temporary = root / f".{uuid.uuid4().hex}"
     temporary.mkdir(parents=True)
     model.save(temporary / MODEL)
@@ -49,10 +69,9 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: float
     monitors = {file.name: file.stat().st_size for file in run.glob(MONITORS)}
     (temporary / "monitors.json").write_text(json.dumps(monitors))
     (temporary / "seconds.json").write_text(json.dumps(seconds))
-    used: set[str] = set()
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None:
-        used = _write_buffer(buffer, temporary, root / "blocks")
+        _write_buffer(buffer, temporary, root / BLOCKS)
     statistics = model.get_vec_normalize_env()
     if statistics is not None:
         (temporary / env_id).mkdir()
@@ -61,14 +80,24 @@ def save_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: float
         if file.is_file():
             with open(file, "rb") as opened:
                 os.fsync(opened.fileno())
-    temporary.rename(final)
-    for stale in root.iterdir():
-        if stale.name != "blocks" and stale != final:
+    temporary.rename(root / f"step_{model.num_timesteps}")
+
+
+def _remove_all_but(checkpoint: Path | None, root: Path) -> None:
+    """Remove other checkpoints, unfinished ones and the blocks of neither."""
+    for stale in root.iterdir() if root.is_dir() else ():
+        if stale.name != BLOCKS and stale != checkpoint:
             discard(stale)
-    for block in (root / "blocks").glob("*"):
+    used = set() if checkpoint is None else {name for names in _block_names(checkpoint) for name in names}
+    for block in (root / BLOCKS).glob("*"):
         if block.name not in used:
             block.unlink()
-    return final
+
+
+def _block_names(checkpoint: Path) -> list[list[str]]:
+    """Names of the blocks of each array of a checkpoint's replay buffer."""
+    file = checkpoint / "blocks.json"
+    return json.loads(file.read_text()) if file.is_file() else []
 
 
 def latest_checkpoint(run: Path) -> Path | None:
@@ -103,9 +132,9 @@ def restore_buffer(model: BaseAlgorithm, checkpoint: Path) -> None:
     """Give a loaded model the replay buffer of a checkpoint."""
     if not (checkpoint / "buffer.pickle").is_file():
         return
-    blocks = checkpoint.parent / "blocks"
+    blocks = checkpoint.parent / BLOCKS
     arrays = []
-    for names in json.loads((checkpoint / "blocks.json").read_text()):
+    for names in _block_names(checkpoint):
         arrays.append(bytearray().join(zlib.decompress((blocks / name).read_bytes()) for name in names))
     buffer = pickle.loads((checkpoint / "buffer.pickle").read_bytes(), buffers=arrays)
     buffer.device = model.device
@@ -129,17 +158,13 @@ def read_seconds(checkpoint: Path) -> float:
     return float(json.loads(file.read_text())) if file.is_file() else 0.0
 
 
-def _write_buffer(buffer: Any, folder: Path, blocks: Path) -> set[str]:
-    """
-    :return: names of the blocks that hold the buffer's arrays
-    """
+def _write_buffer(buffer: Any, folder: Path, blocks: Path) -> None:
     arrays: list[pickle.PickleBuffer] = []
     stream = pickle.dumps(buffer, protocol=5, buffer_callback=arrays.append)
     blocks.mkdir(exist_ok=True)
     names = [[_write_block(part, blocks) for part in _parts(array.raw())] for array in arrays]
     (folder / "buffer.pickle").write_bytes(stream)
     (folder / "blocks.json").write_text(json.dumps(names))
-    return {name for of_array in names for name in of_array}
 
 
 def _parts(data: memoryview) -> list[memoryview]:

@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 from sb3_por.runs.folder import (
     ARGUMENTS,
     EVALUATIONS,
     HYPERPARAMETERS,
-    LOCK,
     LOG,
     MONITORS,
     is_finished,
@@ -20,6 +18,7 @@ from sb3_por.runs.folder import (
     read_settings,
     run_arguments,
 )
+from sb3_por.runs.lock import is_locked
 
 #: Lines of a log that are kept.
 LOG_LINES = 15
@@ -90,7 +89,7 @@ def _facts(run: Path) -> RunFacts:
     return RunFacts(
         **identity,
         folder=run,
-        state="finished" if finished else "running" if is_running(run) else "stopped",
+        state="finished" if finished else "running" if is_locked(run) else "stopped",
         steps=progress(run)[0],
         planned=None if planned is None else int(planned),
         commit=arguments.get("commit", ""),
@@ -102,20 +101,6 @@ def _facts(run: Path) -> RunFacts:
 
 def _last_lines(log: Path) -> list[str]:
     return log.read_text(errors="replace").splitlines()[-LOG_LINES:] if log.is_file() else []
-
-
-def is_running(run: Path) -> bool:
-    """Whether a process is at work in a run's folder, as far as can be told: on this machine."""
-    lock = run / LOCK
-    if not lock.is_file():
-        return False
-    try:
-        with FileLock(lock, timeout=0):
-            return False
-    except Timeout:
-        return True
-    except OSError:  # a folder that can only be read
-        return False
 
 
 def progress(run: Path) -> tuple[int, float | None]:

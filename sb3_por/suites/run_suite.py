@@ -8,14 +8,14 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.live import Live
 from rich.table import Column, Table
 
 from sb3_por.analysis.scores import read_scores, write_csv
-from sb3_por.common.errors import UserError
-from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, LOCK, read_settings
+from sb3_por.common.files import check_writable
+from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, read_settings
+from sb3_por.runs.lock import lock_folder
 from sb3_por.suites.pools import LocalPool, Pool
 from sb3_por.suites.suite_file import Run, Suite, find_suite, read_suite, suite_runs
 
@@ -42,12 +42,12 @@ def run_suite(path: str | Path, root: str | Path = "runs", dry_run: bool = False
         for run in runs:
             print(f"{run.state():12} {shlex.join(run.command())}")
         return 0
-    folder.mkdir(parents=True, exist_ok=True)
+    check_writable(folder)
+    lock = lock_folder(folder, f"another process is at work on the suite in {folder}; wait for it, or give another --root")
     try:
-        with FileLock(folder / LOCK, timeout=0):
-            return _do(_pool(suite, runs, ray), folder)
-    except Timeout as error:
-        raise UserError(f"another process is at work on the suite in {folder}; wait for it, or give another --root") from error
+        return _do(_pool(suite, runs, ray), folder)
+    finally:
+        lock.release()
 
 
 def _pool(suite: Suite, runs: list[Run], ray: str | None) -> Pool:

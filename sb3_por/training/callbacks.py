@@ -8,11 +8,13 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write
 from sb3_por.common.random_state import set_rng_state
-from sb3_por.evaluation.episodes import Episode, Evaluation, run_episodes, score
+from sb3_por.evaluation.episodes import Episode, Evaluation, has_diverged, run_episodes, score
 from sb3_por.runs.checkpoints import save_checkpoint
 from sb3_por.runs.folder import BEST_MODEL, EVALUATIONS, intermediate_model
+from sb3_por.training.full_disk import forgoing
 
 
 def is_due(callback: BaseCallback, interval: int) -> bool:
@@ -118,12 +120,13 @@ class EvaluationCallback(EvalCallback):
         self.last_mean_reward = float(np.mean(evaluation.returns))
         go_on = True
         if evaluation.score > self.best_mean_reward:
-            # SB3 calls the number that models are ranked by a reward, and other callbacks read it under that name.
-            self.best_mean_reward = evaluation.score
-            with atomic_write(self.run / BEST_MODEL) as path:
-                self.model.save(path)
-            if self.callback_on_new_best is not None:
-                go_on = self.callback_on_new_best.on_step()
+            with forgoing(f"{BEST_MODEL} is not the best model, and the next evaluation that beats it replaces it"):
+                with atomic_write(self.run / BEST_MODEL) as path:
+                    self.model.save(path)
+                if self.callback_on_new_best is not None:
+                    go_on = self.callback_on_new_best.on_step()
+                # SB3 calls the number that models are ranked by a reward, and other callbacks read it under that name.
+                self.best_mean_reward = evaluation.score
         return go_on
 
     def _record(self, evaluation: Evaluation) -> None:
@@ -138,7 +141,7 @@ class EvaluationCallback(EvalCallback):
         }
         for name, value in row.items():
             self._history.setdefault(name, []).append(value)
-        with atomic_write(self.run / EVALUATIONS) as path:
+        with forgoing("the next evaluation writes this one, too"), atomic_write(self.run / EVALUATIONS) as path:
             np.savez(path, **{name: np.array(values) for name, values in self._history.items()})  # type: ignore[arg-type]  # numpy's stubs
 
         self.logger.record("eval/mean_reward", float(np.mean(evaluation.returns)))
@@ -177,7 +180,7 @@ class CheckpointCallback(BaseCallback):
     Saves the model as ``rl_model_<steps>_steps.zip``, and a checkpoint from which a killed run is resumed.
 
     It saves between two rollouts, when every transition is stored and every update is done. There it also ends training
-    after a signal.
+    after a signal. Networks that hold NaN are not saved.
 
     :param save_freq: Interval in environment steps; 0 to save only after a signal
     :param run: Folder of the run
@@ -214,9 +217,15 @@ class CheckpointCallback(BaseCallback):
         if self.at_start:
             self.at_start = False
             self._save_checkpoint()
-        if self._count_due() > self._n_due:
+        due = self._count_due() > self._n_due
+        if (due or self.stop_requested) and has_diverged(self.model):
+            raise UserError("the networks hold NaN")
+        if due:
             self._n_due = self._count_due()
-            with atomic_write(self.run / intermediate_model(self.model.num_timesteps)) as path:
+            with (
+                forgoing("this file will be missing"),
+                atomic_write(self.run / intermediate_model(self.model.num_timesteps)) as path,
+            ):
                 self.model.save(path)
             self._save_checkpoint()
         if self.stop_requested:
@@ -224,7 +233,8 @@ class CheckpointCallback(BaseCallback):
             raise KeyboardInterrupt
 
     def _save_checkpoint(self) -> None:
-        save_checkpoint(self.model, self.run, self.env_id, self.stopwatch.seconds())
+        with forgoing("it can be resumed from the checkpoint before"):
+            save_checkpoint(self.model, self.run, self.env_id, self.stopwatch.seconds())
 
     def _on_step(self) -> bool:
         return True

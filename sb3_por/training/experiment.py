@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim
 from rl_zoo3.exp_manager import ExperimentManager
@@ -18,11 +17,11 @@ from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por.common.errors import UserError, UserNote, one_line
-from sb3_por.common.files import atomic_write, remove_unfinished
+from sb3_por.common.files import DISK_ERRORS, DiskError, atomic_write, remove_unfinished
 from sb3_por.evaluation.episodes import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
 from sb3_por.evaluation.loading import quiet_n_steps
 from sb3_por.runs.checkpoints import (
@@ -41,7 +40,6 @@ from sb3_por.runs.folder import (
     COMMAND,
     EVALUATIONS,
     HYPERPARAMETERS,
-    LOCK,
     REPLAY_BUFFER,
     STATISTICS,
     TENSORBOARD,
@@ -51,8 +49,11 @@ from sb3_por.runs.folder import (
     read_settings,
     write_settings,
 )
+from sb3_por.runs.lock import lock_folder
 from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
+from sb3_por.training.full_disk import PatientLogs, keep_playing
 from sb3_por.training.trials import trial_settings
+from sb3_por.training.workers import WorkerProcesses
 from sb3_por.visual.algorithm import VisualAlgorithm
 
 
@@ -85,6 +86,8 @@ class Experiment(ExperimentManager):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        if self.vec_env_class is SubprocVecEnv:
+            self.vec_env_class = WorkerProcesses
         self._uuid = kwargs["uuid_str"]
         self._folder_made = False
         self._interrupted = False
@@ -139,21 +142,13 @@ class Experiment(ExperimentManager):
         self.params_path = os.path.join(self.save_path, self.env_name)
         os.makedirs(self.params_path, exist_ok=True)
         self._folder_made = self._resumed_run is None
-        self._lock_folder()
+        self._lock = lock_folder(Path(self.save_path), f"another process is at work in {self.save_path}")
         if self._resumed_run is not None:
             remove_unfinished(self._resumed_run)
             if self._checkpoint is not None:
                 restore_monitors(self._resumed_run, self._checkpoint)
         if self.tensorboard_log is None and not self.optimize_hyperparameters:
             self.tensorboard_log = os.path.join(self.save_path, TENSORBOARD)
-
-    def _lock_folder(self) -> None:
-        """Two processes must not write one run. The system frees the lock of a killed one."""
-        self._lock = FileLock(os.path.join(self.save_path, LOCK))
-        try:
-            self._lock.acquire(timeout=0)
-        except Timeout as error:
-            raise UserError(f"another process is at work in {self.save_path}") from error
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
@@ -181,15 +176,14 @@ class Experiment(ExperimentManager):
         Evaluation plays the same held-out episodes each time; the zoo's begin as the training environment does.
         ``VecNormalize`` is the outermost wrapper, since the replay buffer stores what it receives.
         """
-        if not eval_env:
-            return super()._maybe_normalize(super().create_envs(n_envs, no_log=no_log), eval_env)
-        inner = self.env_wrapper
-        self.env_wrapper = FixedEpisodes if inner is None else lambda env: FixedEpisodes(inner(env))
+        inner, last = self.env_wrapper, FixedEpisodes if eval_env else keep_playing
+        self.env_wrapper = last if inner is None else lambda env: last(inner(env))
         try:
-            env = super().create_envs(n_envs, eval_env=True, no_log=no_log)
+            env = super().create_envs(n_envs, eval_env=eval_env, no_log=no_log)
         finally:
             self.env_wrapper = inner
-        env.env_method("play", evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes))
+        if eval_env:
+            env.env_method("play", evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes))
         return super()._maybe_normalize(env, eval_env)
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
@@ -200,6 +194,7 @@ class Experiment(ExperimentManager):
         """Our evaluation and checkpoints, counted in environment steps."""
         if self.show_progress:
             self.callbacks.append(ProgressBarCallback())
+        self.callbacks.append(PatientLogs())
         stopwatch = Stopwatch(self._seconds_before())
         if self.eval_freq > 0 and not self.optimize_hyperparameters:
             self.callbacks.append(
@@ -254,7 +249,8 @@ class Experiment(ExperimentManager):
         write_settings(Path(self.params_path) / HYPERPARAMETERS, dict(sorted(saved_hyperparams.items())))
         write_settings(Path(self.params_path) / ARGUMENTS, dict(sorted({**vars(self.args), "resume": None}.items())))
         if self._resumed_run is None:
-            (Path(self.params_path) / COMMAND).write_text(" ".join(sys.orig_argv))
+            with atomic_write(Path(self.params_path) / COMMAND) as path:
+                path.write_text(" ".join(sys.orig_argv))
         print(f"Log path: {self.save_path}")
 
     def learn(self, model: BaseAlgorithm) -> None:
@@ -271,19 +267,30 @@ class Experiment(ExperimentManager):
         handlers = {number: signal.signal(number, self._request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             model.learn(n_timesteps, **kwargs)
+            if has_diverged(model):
+                raise UserError("the networks hold NaN")
         except KeyboardInterrupt:
             self._interrupted = True
-        except ValueError as error:
-            if not has_diverged(model):
-                raise
-            raise UserError(
-                f"training diverged before step {model.num_timesteps}: the networks hold NaN. What was saved in "
-                f"{self.save_path} before is sound; a lower learning_rate may help"
-            ) from error
+        except (OSError, ValueError) as error:
+            if has_diverged(model):
+                reason = one_line(error) if isinstance(error, UserError) else "the networks hold NaN"
+                how = self._how_to_resume("-params learning_rate:LOWER")
+                raise UserError(f"training diverged before step {model.num_timesteps}: {reason}; {how}") from error
+            if isinstance(error, UserError) or getattr(error, "errno", None) in DISK_ERRORS:
+                raise UserError(f"step {model.num_timesteps}: {one_line(error)}; {self._how_to_resume()}") from error
+            raise
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
             self._close(model)
+
+    def _how_to_resume(self, change: str = "") -> str:
+        """The last checkpoint, and the command that resumes from it."""
+        checkpoint = latest_checkpoint(Path(self.save_path))
+        if checkpoint is None:
+            return f"there is no checkpoint yet in {self.save_path}"
+        command = f"python train.py --resume {self.save_path} {change}".rstrip()
+        return f"the last checkpoint is {checkpoint}, resume from it with: {command}"
 
     def _request_stop(self, number: int, frame: Any) -> None:
         """The first signal waits for a safe place, the second does not."""
@@ -306,16 +313,24 @@ class Experiment(ExperimentManager):
         if self._interrupted and latest_checkpoint(Path(self.save_path)) is None:
             # A model without a checkpoint is what marks a finished run.
             raise KeyboardInterrupt(message)
-        save: Callable[[Path], Any] = model.save
-        with atomic_write(Path(self.save_path) / last_model(str(self.env_name))) as path:
-            save(path)
-        if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
-            with atomic_write(Path(self.save_path) / REPLAY_BUFFER) as path:
-                model.save_replay_buffer(path)
-        statistics = model.get_vec_normalize_env()
-        if statistics is not None:
-            statistics.save(os.path.join(self.params_path, STATISTICS))
+        try:
+            self._write_model(model)
+        except DiskError as error:
+            raise UserError(f"{error}; {self._how_to_resume()}") from error
         print(f"Saved to {self.save_path}")
         if self._interrupted:
             raise KeyboardInterrupt(message)
         remove_checkpoints(Path(self.save_path))
+
+    def _write_model(self, model: BaseAlgorithm) -> None:
+        """Write the last model last: it marks a finished run."""
+        save: Callable[[Path], Any] = model.save
+        statistics = model.get_vec_normalize_env()
+        if statistics is not None:
+            with atomic_write(Path(self.params_path) / STATISTICS) as path:
+                statistics.save(str(path))
+        if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
+            with atomic_write(Path(self.save_path) / REPLAY_BUFFER) as path:
+                model.save_replay_buffer(path)
+        with atomic_write(Path(self.save_path) / last_model(str(self.env_name))) as path:
+            save(path)

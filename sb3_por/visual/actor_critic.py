@@ -1,5 +1,6 @@
 """One update of the visual algorithms: critic and objective train the encoder, then the actor follows (Algorithm 1)."""
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import polyak_update, update_learning_rate
 from torch.nn import functional as F
 
+from sb3_por.common.errors import UserError
 from sb3_por.visual.algorithm import VisualAlgorithm
 from sb3_por.visual.batch import Frames, demonstrated, encode, interleave, repeat, take
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
@@ -328,8 +330,16 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         self._log_objective(self.control_metrics(batch))
 
     def _record_metrics(self) -> None:
-        """Hand the running means to the logger, which averages them until it writes. Nothing else waits for the device."""
+        """
+        Hand the running means to the logger, which averages them until it writes. Nothing else waits for the device.
+
+        :raises UserError: If a loss is not finite
+        """
         for name, mean in self._metrics.take().items():
+            if name.endswith("loss") and not math.isfinite(mean):
+                raise UserError(
+                    f"{name} is {mean} at update {self._n_updates}: lower the learning_rate, or load an earlier model"
+                )
             self.logger.record_mean(f"train/{name}", mean)
 
     def dump_logs(self) -> None:

@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-import psutil
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
@@ -11,6 +10,7 @@ from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_por.acceleration.transfer import free_memory, to_device
+from sb3_por.common.memory import available_memory
 
 Observations = th.Tensor | TensorDict
 
@@ -223,7 +223,7 @@ class SequenceReplayBuffer(NStepReplayBuffer):
         if free is not None and storage != "cpu" and (storage == "cuda" or needed <= 0.4 * free):
             self._check_memory(needed, free, n_frames, "GPU memory")
             return self.device
-        self._check_memory(needed, psutil.virtual_memory().available, n_frames, "memory")
+        self._check_memory(needed, available_memory(), n_frames, "memory")
         return th.device("cpu")
 
     def _check_memory(self, needed: int, available: int, n_frames: int, kind: str) -> None:

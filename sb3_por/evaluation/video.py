@@ -1,11 +1,13 @@
 """Videos of a model's episodes, as GIF or MP4."""
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import imageio.v2 as imageio
 from gymnasium.wrappers import RenderCollection
+from imageio_ffmpeg import count_frames_and_secs
 
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.files import atomic_write, check_output
@@ -98,21 +100,12 @@ def write_video(path: str | Path, frames: list[Any], fps: float) -> None:
     with atomic_write(path) as temporary:
         if path.suffix.lower() == ".gif":
             # In memory first: on a full disk Pillow's writer would fail a second time when it is collected.
-            temporary.write_bytes(imageio.mimwrite("<bytes>", frames, format="gif", duration=1000 / fps, loop=0))
+            video = BytesIO()
+            imageio.mimwrite(video, frames, format="gif", duration=1000 / fps, loop=0)  # type: ignore[call-overload]  # a name
+            temporary.write_bytes(video.getvalue())
         else:
             # H.264 needs even sizes: other frames are scaled up to the next multiple of 2.
             imageio.mimwrite(temporary, frames, fps=fps, macro_block_size=2)
-            _check_complete(temporary)
-
-
-def _check_complete(path: Path) -> None:
-    """
-    ffmpeg runs in a process of its own, and imageio does not look at how it ended: on a full disk, with half a video.
-
-    :raises OSError: If the video cannot be read
-    """
-    try:
-        with imageio.get_reader(path) as reader:
-            reader.get_next_data()
-    except (OSError, IndexError) as error:
-        raise OSError(f"cannot write the video: {one_line(error)}") from error
+            # imageio does not look at how ffmpeg's process ended: on a full disk, with half a video.
+            if count_frames_and_secs(str(temporary))[0] != len(frames):
+                raise OSError(f"ffmpeg has not written all of {path}")

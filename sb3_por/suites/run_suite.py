@@ -5,6 +5,7 @@ import shlex
 import signal
 import sys
 import time
+import warnings
 from contextlib import closing
 from pathlib import Path
 
@@ -13,9 +14,11 @@ from rich.live import Live
 from rich.table import Column, Table
 
 from sb3_por.analysis.scores import read_scores, write_csv
+from sb3_por.common.errors import UserNote
 from sb3_por.common.files import check_writable
 from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, read_settings
 from sb3_por.runs.lock import lock_folder
+from sb3_por.suites.memory import overcommitment
 from sb3_por.suites.pools import LocalPool, Pool
 from sb3_por.suites.suite_file import Run, Suite, find_suite, read_suite, suite_runs
 
@@ -38,6 +41,10 @@ def run_suite(path: str | Path, root: str | Path = "runs", dry_run: bool = False
     suite = read_suite(path)
     folder = Path(root) / path.stem
     runs = suite_runs(suite, folder)
+    workers = suite.workers or max((os.cpu_count() or 1) // suite.threads, 1)
+    too_much = overcommitment([run for run in runs if run.state() != "finished"], workers) if ray is None else None
+    if too_much is not None:
+        warnings.warn(too_much, UserNote)
     if dry_run:
         for run in runs:
             print(f"{run.state():12} {shlex.join(run.command())}")
@@ -45,14 +52,14 @@ def run_suite(path: str | Path, root: str | Path = "runs", dry_run: bool = False
     check_writable(folder)
     lock = lock_folder(folder, f"another process is at work on the suite in {folder}; wait for it, or give another --root")
     try:
-        return _do(_pool(suite, runs, ray), folder)
+        return _do(_pool(suite, runs, workers, ray), folder)
     finally:
         lock.release()
 
 
-def _pool(suite: Suite, runs: list[Run], ray: str | None) -> Pool:
+def _pool(suite: Suite, runs: list[Run], workers: int, ray: str | None) -> Pool:
     if ray is None:
-        return LocalPool(runs, suite.workers or max((os.cpu_count() or 1) // suite.threads, 1), suite.threads)
+        return LocalPool(runs, workers, suite.threads)
     from sb3_por.suites.ray_pool import RayPool
 
     return RayPool(runs, suite.threads, suite.gpus, ray)

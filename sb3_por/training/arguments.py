@@ -4,6 +4,7 @@ import argparse
 import importlib.util
 import os
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from rl_zoo3.utils import StoreDict
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import ALGORITHMS
-from sb3_por.common.errors import UserError, check_known, one_line
+from sb3_por.common.errors import UserError, UserNote, check_known, one_line
 from sb3_por.common.files import check_writable
 from sb3_por.common.shipped import shipped
 from sb3_por.evaluation.loading import find_environment, import_packages, model_file, read_data
@@ -23,7 +24,7 @@ from sb3_por.runs.checkpoints import (
     remove_checkpoints,
 )
 from sb3_por.runs.folder import ARGUMENTS, import_names, last_model, run_arguments, the_run
-from sb3_por.runs.provenance import current_commit, current_machine
+from sb3_por.runs.provenance import current_commit, current_machine, current_provenance, differences
 
 EXAMPLE = """example:
   python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:10.0 pairing:paper
@@ -112,6 +113,7 @@ class Parser(argparse.ArgumentParser):
         _choose_threads(args)
         args.commit = current_commit()
         args.machine = current_machine()
+        args.provenance = current_provenance(args.num_threads)
         return args
 
     def _resumed(self, run: Path) -> argparse.Namespace:
@@ -133,6 +135,7 @@ class Parser(argparse.ArgumentParser):
         import_packages(args.gym_packages)
         check_writable(run)
         _choose_threads(args)
+        _note_changes(args)
         return args
 
 
@@ -158,6 +161,18 @@ def _choose_threads(args: argparse.Namespace) -> None:
         args.num_threads = 1
     if args.num_threads > 0:
         os.environ["OMP_NUM_THREADS"] = str(args.num_threads)
+
+
+def _note_changes(args: argparse.Namespace) -> None:
+    """Tell what differs from where a resumed run began, and record it in the run's arguments (``resumed_with``)."""
+    before = getattr(args, "provenance", None)
+    changed = differences(before, current_provenance(args.num_threads)) if before else {}
+    if changed:
+        told = ", ".join(
+            f"{name} {then or 'none'} -> {now or 'none'}" for name, (then, now) in changed.items() if name != "cpu_flags"
+        )
+        warnings.warn(f"the run continues where its numbers may differ in the last bits: {told or 'cpu_flags'}", UserNote)
+        args.resumed_with = [*getattr(args, "resumed_with", []), {name: now for name, (_, now) in changed.items()}]
 
 
 def _check_hyperparameters(file: Path, env_id: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[2]
 #: What pages are, show and link to.
@@ -62,8 +63,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **kwargs: Any) -> str:
-    """Let links to modules lead to the API."""
+def on_page_markdown(markdown: str, page: Page, **kwargs: Any) -> str:
+    """Let links to modules lead to the API; the first page has no neighbours to show."""
+    if page.is_homepage:
+        page.meta["hide"] = ["navigation"]
 
     def to_api(link: re.Match[str]) -> str:
         up, package, module = link[1], link[2].replace("/", "."), link[3]

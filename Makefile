@@ -36,8 +36,9 @@ demo: $(VENV)/.installed-test
 
 # The variable silences an advertisement of the theme's successor.
 docs: $(VENV)/.installed-docs
+	@$(BIN)/python -c 'import mkdocs' 2>/dev/null || { echo "make: the site's tools need Python 3.11 to 3.13" >&2; exit 2; }
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet $(ARGS)
-	@echo site/index.html
+	@echo "site/index.html; with its search: $(BIN)/python -m http.server --directory site"
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

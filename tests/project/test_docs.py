@@ -57,6 +57,11 @@ def test_links_lead_somewhere(name):
             assert not anchor or anchor in anchors(linked), target
 
 
+def test_the_pictures_of_the_readme_load_quickly():
+    pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", (ROOT / "README.md").read_text())
+    assert len(pictures) >= 2 and sum((ROOT / picture).stat().st_size for picture in pictures) < 1_500_000
+
+
 #: Records every command of a block, as bash expands it, instead of running it: no command is found on this PATH.
 RECORDER = """
 PATH=/nowhere

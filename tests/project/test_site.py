@@ -64,3 +64,8 @@ def test_a_link_to_a_module_leads_to_its_documentation(site):
     page = (site / "docs" / "howto" / "own_task.html").read_text()
     assert 'href="../api/softbody_envs.html#softbody_envs.env"' in page
     assert 'id="softbody_envs.env.SoftbodyEnv"' in (site / "docs" / "api" / "softbody_envs.html").read_text()
+
+
+def test_pages_load_nothing_from_elsewhere(site):
+    for page in site.rglob("*.html"):
+        assert not re.search(r"<(?:script|link|img|iframe)[^>]*(?:src|href)=\"?(?:https?:)?//", page.read_text()), page.name

@@ -1,5 +1,6 @@
 """Record demonstrations: a policy plays training scenes in the environment that an algorithm's settings make."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,8 @@ class Recorder(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
 
 class AttachedExpert:
     """
-    Scripted expert that reads the state of an environment, whatever is observed there.
+    Scripted expert that reads the state of an environment, whatever is observed there. It may try a scene ``attempts`` times:
+    ``again`` says that the next episode is another attempt.
 
     :param env_id: Gymnasium id of a task with an expert
     :param env: The environment, inside its wrappers
@@ -70,16 +72,18 @@ class AttachedExpert:
         self.observation_space, self.action_space = env.observation_space, env.action_space
         self._env: Any = env.unwrapped
         try:
-            self._expert = make_expert(env_id, Pace.of(env))
+            self._expert: Any = make_expert(env_id, Pace.of(env))
         except ValueError as error:
             raise UserError(one_line(error)) from error
+        self.attempts: int = getattr(self._expert, "attempts", 1)
+        self.again = False
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
         """Return the expert's action, shape ``(1, action_dim)``."""
         if episode_start is None or episode_start[0]:
-            self._expert.reset()
+            self._expert.retry() if self.again else self._expert.reset()
         return self._expert.act(self._env.state())[None].astype(np.float32), state
 
 
@@ -156,12 +160,17 @@ def record(
         player = loaded
         venv = make_evaluation_env(loaded, env_id, **environment | {"env_wrapper": lambda _: recorder})
     try:
-        evaluation = run_episodes(player, venv, training_episodes(env_id, n_episodes, seed))
+        evaluations, recorded = [], []
+        for episode in training_episodes(env_id, n_episodes, seed):
+            evaluation, demonstration = _best_attempt(player, venv, recorder, episode)
+            evaluations.append(evaluation)
+            recorded.append(demonstration)
     finally:
         venv.close()
+    evaluation = _joined(evaluations)
     write_demonstrations(
         path,
-        recorder.episodes,
+        recorded,
         recorder.observation_space,
         recorder.action_space,
         spec,
@@ -181,6 +190,26 @@ def training_episodes(env_id: str, n_episodes: int, seed: int) -> list[Episode]:
     train, has_variations = SPLITS["train"], task_class(env_id) is not None
     order = np.random.default_rng(seed).permutation(train)
     return [Episode(k, seed + k, int(order[k % len(order)]) if has_variations else None) for k in range(n_episodes)]
+
+
+def _best_attempt(player: Any, venv: VecEnv, recorder: Recorder, episode: Episode) -> tuple[Evaluation, RecordedEpisode]:
+    """Play an episode; an expert with several plans plays it until it succeeds, and its best attempt counts."""
+    attempts = []
+    for attempt in range(getattr(player, "attempts", 1)):
+        if isinstance(player, AttachedExpert):
+            player.again = attempt > 0
+        recorder.episodes.clear()
+        evaluation = run_episodes(player, venv, [episode])
+        attempts.append((evaluation, recorder.episodes[0]))
+        if evaluation.successes[0] == 1.0:
+            break
+    return max(attempts, key=lambda one: one[0].score)
+
+
+def _joined(evaluations: list[Evaluation]) -> Evaluation:
+    """One evaluation of all their episodes."""
+    names = [field.name for field in fields(Evaluation)]
+    return Evaluation(**{name: [value for one in evaluations for value in getattr(one, name)] for name in names})
 
 
 def _stack(observations: list[Any]) -> Any:

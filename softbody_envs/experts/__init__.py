@@ -10,7 +10,10 @@ from softbody_envs.registration import ENV_IDS, task_class
 
 
 class Expert(Protocol):
-    """A scripted policy."""
+    """
+    A scripted policy. One whose plan may fail has ``attempts``, the number of plans for a scene, and ``retry()``, which
+    forgets the episode as ``reset()`` does and makes the next plan.
+    """
 
     def reset(self) -> None:
         """Forget the episode."""
@@ -41,7 +44,8 @@ def make_expert(env_id: str, pace: Pace = FULL_SPEED) -> Expert:
     task = task_class(env_id)
     if task is None or task.expert is None:
         raise ValueError(f"no expert for {env_id!r}; there is one for {', '.join(EXPERT_IDS)}")
-    return resolve_name(task.expert)(pace)
+    expert = resolve_name(task.expert)
+    return expert() if pace == FULL_SPEED else expert(pace)
 
 
 #: Ids in ``ENV_IDS`` that have an expert.

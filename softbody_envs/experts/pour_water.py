@@ -24,12 +24,22 @@ SLOWEST_TILT_RATE = 0.015
 FORESIGHT = 4
 #: Fraction of the water that leaves the cup while it tilts back, in addition to the flow.
 RESERVE = 0.04
-#: Largest tilt of one action near the end of a measured pour, rad.
-FINE_TILT = 0.04
 #: Fractions of the water that have left a slowly tilted cup of any size, and the tilts at which they have, rad. The spheres
 #: form a lattice, which gives way at a certain slope.
 FRACTIONS_LEFT = (0.0, 0.2, 0.5, 0.8, 1.0)
 TILTS = (1.45, 1.6, 1.69, 1.76, 1.82)
+#: Water that leaves the cup in a control step, as a fraction of all, below which the next action need not wait for it.
+TRICKLE = 0.002
+#: The same fractions and tilts for a cup that actions of several control steps have tilted to there.
+QUICK_FRACTIONS_LEFT = (0.0, 0.1, 0.3, 0.5, 0.66, 0.85, 1.0)
+QUICK_TILTS = (1.3, 1.38, 1.46, 1.52, 1.62, 1.7, 1.78)
+#: Number of such actions until there, and largest tilt of each that follows, rad.
+FIRST_ACTIONS = 3.5
+LARGEST_CORRECTION = 0.05
+#: First distance of the planned tilt from the expected one, and its change with the second attempt, rad.
+FIRST_AIM = (-0.08, 0.06)
+#: Attempts at one scene.
+ATTEMPTS = 8
 #: Tilt before the expected one at which slow tilting begins, rad.
 HEADROOM = 0.25
 
@@ -74,23 +84,45 @@ class PourWaterExpert:
 
 
 class PourWaterAmountExpert(PourWaterExpert):
-    """Tilts quickly until shortly before the goal, then in small steps, and back as soon as enough water has left the cup."""
+    """
+    Tilts quickly until shortly before the goal, then in small steps, and back as soon as enough water has left the cup.
+
+    An action that lasts for several control steps cannot be taken back in time when the water comes in a surge. Then the
+    expert tilts to where about enough water should leave, waits, and corrects. With another plan it may try a scene again.
+    """
+
+    def __init__(self, pace: Pace = FULL_SPEED) -> None:
+        super().__init__(pace)
+        self.attempts = 1 if pace.repeat == 1 else ATTEMPTS
 
     def reset(self) -> None:
-        """Forget how much water has left the cup."""
+        """Forget the episode, and the plans of former attempts."""
+        self._left = self._goal = 0.0
+        self._aim, self._change = FIRST_AIM
+
+    def retry(self) -> None:
+        """Plan to tilt further at first if too little water has left the cup, or less far if too much has."""
+        self._aim += np.copysign(self._change, self._goal - self._left)
+        self._change *= 0.7
         self._left = 0.0
 
     def tilt_rate(self, state: np.ndarray) -> float:
         seen = named(state)
-        left, goal = 1.0 - seen["fraction in cup"], seen["target fraction"]
-        flow, self._left = (left - self._left) / self._pace.repeat, left
+        left, goal, tilt = 1.0 - seen["fraction in cup"], seen["target fraction"], seen["cup tilt"]
+        flow = (left - self._left) / self._pace.repeat
+        self._left, self._goal = left, goal
         if left + FORESIGHT * flow >= goal - RESERVE:
             return -self._reach[2]
-        if flow > 0.0:
+        if flow > TRICKLE:
             return 0.0
-        expected_tilt, tilt = np.interp(goal, FRACTIONS_LEFT, TILTS), seen["cup tilt"]
-        slowest = min(self._pace.repeat * SLOWEST_TILT_RATE, FINE_TILT)
-        return float(np.clip(expected_tilt - HEADROOM - tilt, slowest, super().tilt_rate(state)))
+        if self._pace.repeat == 1:
+            expected_tilt = np.interp(goal, FRACTIONS_LEFT, TILTS)
+            return TILT_RATE if tilt < expected_tilt - HEADROOM else SLOWEST_TILT_RATE
+        goal_tilt, tilt_so_far = np.interp([goal, left], QUICK_FRACTIONS_LEFT, QUICK_TILTS)
+        planned = goal_tilt + self._aim
+        if left < 0.02 and tilt < planned - 0.02:
+            return min(planned / FIRST_ACTIONS, planned - tilt)
+        return float(np.clip(goal_tilt - tilt_so_far, 0.0, LARGEST_CORRECTION))
 
 
 def named(state: np.ndarray) -> dict[str, Any]:

@@ -15,7 +15,9 @@ from sb3_por import SACPOR, VisualSAC
 from sb3_por.__main__ import main
 from sb3_por.common.errors import UserError
 from sb3_por.demonstrations.dataset import Demonstrations, RecordedEpisode, write_demonstrations
+from sb3_por.runs.environment import TrainingEnvironment
 from sb3_por.training.record import record
+from softbody_envs.experts.pour_water import PourWaterExpert
 from softbody_envs.variations import SPLITS
 from softbody_envs.wrappers import ActionRepeat
 
@@ -187,3 +189,34 @@ def test_without_minari_there_is_a_line_on_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "minari", None)
     with pytest.raises(UserError, match=r"pip install 'sb3-por\[demos\]'"):
         Demonstrations(tmp_path)
+
+
+def test_an_expert_with_several_plans_tries_a_scene_until_it_succeeds(tmp_path, monkeypatch):
+    class Unsteady:
+        """Pours nothing at the first attempt, well at the second, and has a third."""
+
+        attempts = 3
+
+        def __init__(self, pace):
+            self.inner = PourWaterExpert(pace)
+            self.plans = []
+
+        def reset(self):
+            self.plans.append(1)
+
+        def retry(self):
+            self.plans.append(self.plans[-1] + 1)
+
+        def act(self, state):
+            return self.inner.act(state) * (self.plans[-1] == 2)
+
+    made = []
+    monkeypatch.setattr("sb3_por.training.record.make_expert", lambda _, pace: made.append(Unsteady(pace)) or made[-1])
+    made_of = TrainingEnvironment(
+        "PourWater-v0", {"obs_type": "state"}, {"softbody_envs.wrappers.ActionRepeat": {"repeat": 10}}
+    )
+    evaluation = record("expert", "PourWater-v0", tmp_path / "demos", 2, made_of=made_of)
+    assert made[0].plans == [plan for success in evaluation.successes for plan in ([1, 2] if success else [1, 2, 3])]
+    assert 1.0 in evaluation.successes and min(evaluation.normalized_performance) > 0.5
+    episodes = list(Demonstrations(tmp_path / "demos").episodes())
+    assert len(episodes) == 2 and all((episode.actions != 0).any() for episode in episodes)

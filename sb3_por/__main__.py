@@ -39,6 +39,8 @@ def _model_arguments(parser: argparse.ArgumentParser, required: bool = True) -> 
     parser.add_argument("--model", required=required, help=models)
     parser.add_argument("--env", required=required, help="environment id")
     parser.add_argument("--algo", help="algorithm that saved the model, if it cannot be told from the file")
+    safe = "run nothing that the model's file or folder holds: for models of strangers"
+    parser.add_argument("--safe", action="store_true", help=safe)
 
 
 def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,8 +59,10 @@ def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     if args.seed < 0:
         raise UserError(f"--seed must not be negative, got {args.seed}")
     is_reference = args.model in REFERENCES
-    args.env = find_environment(args.env, None if is_reference else args.model)
-    return (REFERENCES[args.model](args.env), {}) if is_reference else resolve(args.model, args.env, algo=args.algo)
+    args.env = find_environment(args.env, None if is_reference else args.model, args.safe)
+    if is_reference:
+        return REFERENCES[args.model](args.env), {}
+    return resolve(args.model, args.env, algo=args.algo, safe=args.safe)
 
 
 def _evaluate(args: argparse.Namespace) -> None:

@@ -1,5 +1,6 @@
 """Environments that give a model the observations it was trained on."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack,
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.frames import n_stacked
 from sb3_por.evaluation.episodes import FixedEpisodes, Model, evaluation_kwargs
+from sb3_por.evaluation.plain_files import STATISTICS, normalize, read_json
 from sb3_por.runs.environment import EnvWrapper, VecEnvWrapper
 from softbody_envs.registration import task_class
 
@@ -28,24 +30,15 @@ def make_evaluation_env(
     :param model: Its ``observation_space`` tells the number of stacked frames
     :param env_id: Gymnasium id
     :param env_kwargs: Arguments of the environment's constructor; None to read them from the model's observation space
-    :param vec_normalize: File of the ``VecNormalize`` statistics that the model was trained with
+    :param vec_normalize: File of the ``VecNormalize`` statistics that the model was trained with: a pickle of SB3, or the
+        model's ``.zip`` if that holds them in plain form
     :param env_wrapper: Wrappers that the model was trained inside; around ``Monitor``, as in the RL Zoo
     :param vec_env_wrapper: Wrappers of the vectorized environments that the model was trained inside
     :return: A vectorized environment that plays held-out episodes
     :raises UserError: If the environment cannot be made, or its spaces are not the model's
     """
     own = observation_kwargs(env_id, model.observation_space) if env_kwargs is None else env_kwargs
-    kwargs = evaluation_kwargs(env_id) | own
-
-    def make() -> gym.Env:
-        env: gym.Env = Monitor(gym.make(env_id, **kwargs))
-        return FixedEpisodes(env if env_wrapper is None else env_wrapper(env))
-
-    try:
-        env: VecEnv = DummyVecEnv([make])
-        env = env if vec_env_wrapper is None else vec_env_wrapper(env)
-    except (TypeError, ValueError, gym.error.Error) as error:
-        raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
+    env = make_wrapped(env_id, own, env_wrapper, vec_env_wrapper)
     try:
         env = _stack_and_normalize(env, model.observation_space, vec_normalize)
         check_for_correct_spaces(env, model.observation_space, model.action_space)
@@ -53,6 +46,33 @@ def make_evaluation_env(
         env.close()
         raise UserError(f"the model was not trained on {env_id}: {one_line(error)}") from error
     return env
+
+
+def make_wrapped(
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    env_wrapper: EnvWrapper | None = None,
+    vec_env_wrapper: VecEnvWrapper | None = None,
+) -> VecEnv:
+    """
+    :param env_id: Gymnasium id
+    :param env_kwargs: Arguments of the environment's constructor
+    :param env_wrapper: Wrappers; around ``Monitor``, as in the RL Zoo
+    :param vec_env_wrapper: Wrappers of the vectorized environments
+    :return: One vectorized environment that plays held-out episodes; frames are not stacked, images not transposed
+    :raises UserError: If the environment cannot be made
+    """
+    kwargs = evaluation_kwargs(env_id) | env_kwargs
+
+    def make() -> gym.Env:
+        env: gym.Env = Monitor(gym.make(env_id, **kwargs))
+        return FixedEpisodes(env if env_wrapper is None else env_wrapper(env))
+
+    try:
+        env: VecEnv = DummyVecEnv([make])
+        return env if vec_env_wrapper is None else vec_env_wrapper(env)
+    except (TypeError, ValueError, gym.error.Error) as error:
+        raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
 
 
 def observation_kwargs(env_id: str, space: spaces.Space) -> dict[str, Any]:
@@ -89,6 +109,8 @@ def _stack(env: VecEnv, space: spaces.Space) -> VecEnv:
 
 
 def _normalize(env: VecEnv, statistics: str) -> VecEnv:
+    if statistics.endswith(".zip"):
+        return normalize(env, read_json(Path(statistics), STATISTICS))
     env = VecNormalize.load(statistics, env)
     env.training = env.norm_reward = False
     return env

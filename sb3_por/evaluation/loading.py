@@ -1,28 +1,26 @@
 """Loading of any saved model for use: with its algorithm and its environment, without its replay buffer."""
 
 import importlib
-import inspect
-import json
 import pickle
 import warnings
-import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import sb3_contrib
-import stable_baselines3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecFrameStack
 
-from sb3_por import ALGORITHMS
+from sb3_por.common import plain
 from sb3_por.common.errors import UserError, UserNote, check_known, one_line
-from sb3_por.evaluation.environment import observation_kwargs
+from sb3_por.evaluation import plain_files
+from sb3_por.evaluation.environment import make_wrapped, observation_kwargs
 from sb3_por.evaluation.episodes import Model, whole_episodes
+from sb3_por.evaluation.model_files import LOADABLE, candidates, model_file, read_data
+from sb3_por.evaluation.safe_loading import check_environment, is_plain, load_safe
 from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, VecEnvWrapper, import_wrappers
 from sb3_por.runs.folder import (
-    ARGUMENTS,
     BEST_MODEL,
     BEST_STATISTICS,
     HYPERPARAMETERS,
@@ -30,15 +28,11 @@ from sb3_por.runs.folder import (
     import_names,
     read_settings,
     run_arguments,
-    the_run,
 )
+from sb3_por.runs.origin import note_foreign
 
-#: name -> class of every algorithm whose models can be loaded; a DDPG model is a TD3 model with other settings
-LOADABLE: dict[str, type[BaseAlgorithm]] = {
-    **{name.lower(): getattr(stable_baselines3, name) for name in ("A2C", "DQN", "PPO", "SAC", "TD3")},
-    **{name.lower(): getattr(sb3_contrib, name) for name in ("CrossQ", "TQC", "TRPO")},
-    **ALGORITHMS,
-}
+#: Most stacked frames of a stranger's model
+MAX_FRAMES = 64
 
 
 @contextmanager
@@ -54,19 +48,21 @@ def load_model(path: str | Path, algo: str | None = None, device: str = "auto") 
     :param path: a model's ``.zip``, or a run folder, which stands for its ``best_model.zip``
     :param algo: name of its algorithm; found from the file if ``None``
     :param device: PyTorch device
-    :return: the model, ready to predict; its replay buffer holds one transition
+    :return: the model, ready to predict; its replay buffer holds one transition. Pickled code in the file is run, with a note
+        unless ``train.py`` wrote it here; :func:`load_safe` runs none
     :raises UserError: if the file is not a saved model, or not one of this algorithm
     """
     path = model_file(path)
     data = read_data(path)
     if algo is not None:
         check_known("algorithm", algo, LOADABLE)
-        candidates = [algo]
-    else:
-        candidates = _candidates(path, data)
+    if is_plain(data):
+        return load_safe(path, device=device, algo=algo)
+    note_foreign(path)
+    names = candidates(path, data) if algo is None else [algo]
     buffer: dict[str, Any] = {"buffer_size": 1} if "buffer_size" in data else {}
     problem: Exception | None = None
-    for name in candidates:
+    for name in names:
         try:
             with quiet_n_steps():
                 return LOADABLE[name].load(path, device=device, **buffer)
@@ -75,20 +71,7 @@ def load_model(path: str | Path, algo: str | None = None, device: str = "auto") 
             problem = problem or error
     if problem is None:
         raise UserError(f"cannot tell which algorithm saved {path}; say --algo, one of {', '.join(LOADABLE)}")
-    raise UserError(f"{path} is not a model of {' or '.join(candidates)}: {one_line(problem)[:200]}") from problem
-
-
-def model_file(path: str | Path) -> Path:
-    """
-    :param path: a model's ``.zip``, or a run folder or one with a single run in it, which stands for its ``best_model.zip``
-    :raises UserError: if there is no such file
-    """
-    path = Path(path)
-    if path.is_dir():
-        path = the_run(path) / BEST_MODEL
-    if not path.is_file():
-        raise UserError(f"there is no model {path}; give a .zip that train.py or model.save() wrote")
-    return path
+    raise UserError(f"{path} is not a model of {' or '.join(names)}: {one_line(problem)[:200]}") from problem
 
 
 def resolve(
@@ -99,6 +82,7 @@ def resolve(
     env_wrapper: EnvWrapper | None = None,
     vec_env_wrapper: VecEnvWrapper | None = None,
     algo: str | None = None,
+    safe: bool = False,
 ) -> tuple[Any, dict[str, Any]]:
     """
     Load a model, and find out which environment it was trained in: from its run's folder, else from the model itself.
@@ -110,15 +94,19 @@ def resolve(
     :param env_wrapper: Replaces the wrappers
     :param vec_env_wrapper: Replaces the wrappers of the vectorized environments
     :param algo: Name of the algorithm, see :func:`load_model`
+    :param safe: Run nothing that a stranger has written: neither in the model's file, nor named in its folder. Files without
+        pickled code are always loaded so
     :return: The model, and the other arguments of :func:`sb3_por.evaluation.environment.make_evaluation_env`
     :raises UserError: If the model cannot be loaded, or a wrapper cannot be imported
     """
     given = {"vec_normalize": vec_normalize, "env_wrapper": env_wrapper, "vec_env_wrapper": vec_env_wrapper}
     given = {name: value for name, value in given.items() if value is not None}
     if isinstance(model, (str, Path)):
-        find_environment(env_id, model)
-        path, model = model, load_model(model, algo)
-        environment = trained_in(path, env_id)
+        path = model_file(model)
+        safe = safe or is_plain(read_data(path))
+        find_environment(env_id, path, safe)
+        environment = trained_in(path, env_id, safe)
+        model = _load_safe(path, env_id, environment, algo) if safe else load_model(path, algo)
     else:
         quiet = bool(given) or env_kwargs is not None
         environment = _arguments(TrainingEnvironment.of_model(model), env_id, None, quiet)
@@ -128,13 +116,29 @@ def resolve(
     return model, environment | given
 
 
-def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
+def _load_safe(path: Path, env_id: str, environment: dict[str, Any], algo: str | None) -> BaseAlgorithm:
+    """Make the environment for a file that does not describe its spaces."""
+    if plain.ATTRIBUTE in plain_files.read_json(path):
+        return load_safe(path, algo=algo)
+    wrappers = environment["env_wrapper"], environment["vec_env_wrapper"]
+    env = make_wrapped(env_id, environment["env_kwargs"] or {}, *wrappers)
+    try:
+        n_frames = read_settings(path.parent / env_id.rpartition(":")[2] / HYPERPARAMETERS).get("frame_stack") or 1
+        if not isinstance(n_frames, int) or not 1 <= n_frames <= MAX_FRAMES:
+            raise UserError(f"frame_stack is refused: {n_frames!r:.80} is no number from 1 to {MAX_FRAMES}")
+        return load_safe(path, VecFrameStack(env, n_frames) if n_frames > 1 else env, algo=algo)
+    finally:
+        env.close()
+
+
+def trained_in(path: str | Path, env_id: str, safe: bool = False) -> dict[str, Any]:
     """
     :param path: A run folder, or the path of a model
     :param env_id: Gymnasium id
+    :param safe: Refuse what could run code of a stranger's choice
     :return: Arguments of :func:`sb3_por.evaluation.environment.make_evaluation_env`, besides model and id: from the run's
         folder, else from the model's ``.zip``; None for what neither tells of this environment
-    :raises UserError: If a wrapper cannot be imported
+    :raises UserError: If a wrapper cannot be imported, or something is refused
     """
     file = model_file(path)
     folder = file.parent / env_id.rpartition(":")[2]
@@ -145,12 +149,19 @@ def trained_in(path: str | Path, env_id: str) -> dict[str, Any]:
         settings["env_kwargs"] = {**(settings.get("env_kwargs") or {}), **given}
         made_of: TrainingEnvironment | None = TrainingEnvironment.of_settings(folder.name, settings)
     else:
-        made_of = TrainingEnvironment.of_data(read_data(file))
+        made_of = TrainingEnvironment.of_data(plain_files.read_json(file) if safe else read_data(file))
         if made_of is None:
             warnings.warn(f"{file} does not tell how its environment was wrapped: {env_id} is made without wrappers", UserNote)
     of_best = folder / BEST_STATISTICS
-    statistics = of_best if file.name == BEST_MODEL and of_best.is_file() else folder / STATISTICS
-    return _arguments(made_of, env_id, str(statistics) if statistics.is_file() else None)
+    pickled = of_best if file.name == BEST_MODEL and of_best.is_file() else folder / STATISTICS
+    statistics = pickled if pickled.is_file() else None
+    if safe and made_of is not None:
+        check_environment(made_of)
+    if safe or statistics is None:
+        statistics = file if plain_files.has_statistics(file) else None
+        if safe and statistics is None and pickled.is_file() and made_of is not None and made_of.normalizes_observations:
+            raise UserError(f"{pickled} is a pickle, which safe loading does not read; export the run where it is trusted")
+    return _arguments(made_of, env_id, None if statistics is None else str(statistics))
 
 
 def _arguments(
@@ -189,58 +200,22 @@ def import_packages(names: Iterable[str]) -> None:
             raise UserError(f"cannot import the package {name}: {one_line(error)}") from error
 
 
-def find_environment(env_id: str, model: str | Path | None = None) -> str:
+def find_environment(env_id: str, model: str | Path | None = None, safe: bool = False) -> str:
     """
     Import what registers an environment: the package in its name (``"package:Name-v0"``), and those that a run was given.
 
     :param env_id: a Gymnasium id, perhaps with a package
     :param model: Model file or run folder, see :func:`load_model`
+    :param safe: Import only what the id names
     :return: the id without the package
     :raises UserError: if there is no such environment
     """
     package, _, name = env_id.rpartition(":")
     import_packages([package] if package else [])
-    if model is not None:
-        import_packages(run_arguments(model_file(model).parent).get("gym_packages") or [])
+    packages = [] if model is None else run_arguments(model_file(model).parent).get("gym_packages") or []
+    if not safe:
+        import_packages(packages)
+    elif packages and name not in gym.registry:
+        raise UserError(f"safe loading does not import the run's package {packages[0]!r:.80}; --env PACKAGE:{name} does")
     check_known("environment", name, gym.registry)
     return name
-
-
-def read_data(path: Path) -> dict[str, Any]:
-    """
-    :param path: a model's ``.zip``
-    :return: the attributes of the saved model; values that are not JSON as SB3 wrote them
-    :raises UserError: if the file is corrupt or was not saved by SB3
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if damaged := archive.testzip():
-                raise UserError(f"{path} is corrupt: {damaged} in it cannot be read; use another checkpoint")
-            data = json.loads(archive.read("data"))
-            data["policy_class"], data["observation_space"], archive.getinfo("policy.pth")
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise UserError(f"{path} is corrupt or no .zip at all: {one_line(error)}; use another checkpoint") from error
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"{path} was not saved by Stable-Baselines3; give a .zip that model.save() wrote") from error
-    return data
-
-
-def _candidates(path: Path, data: dict[str, Any]) -> list[str]:
-    """
-    Algorithms that may have saved a model, the likeliest first: those with its policy class; among them the one that
-    its run's settings name; then those that have most of their constructor's arguments in the file.
-    """
-    recorded = {read_settings(settings).get("algo") for settings in path.parent.glob(f"*/{ARGUMENTS}")}
-    module = data["policy_class"].get("__module__") if isinstance(data["policy_class"], dict) else None
-
-    def unlikeliness(name: str) -> tuple[bool, int, int]:
-        constructors = [vars(cls)["__init__"] for cls in LOADABLE[name].__mro__ if "__init__" in vars(cls)]
-        arguments = {argument for init in constructors for argument in inspect.signature(init).parameters}
-        return name not in recorded, len(arguments - set(data)), -len(arguments)
-
-    names = [
-        name for name, cls in LOADABLE.items() if any(policy.__module__ == module for policy in cls.policy_aliases.values())
-    ]
-    return sorted(names, key=unlikeliness)

@@ -6,6 +6,7 @@ from pathlib import Path
 from sb3_por.common.files import atomic_write
 from sb3_por.runs.checkpoints import discard, latest_checkpoint
 from sb3_por.runs.folder import CHECKPOINTS
+from sb3_por.runs.origin import mark_as_own
 from sb3_por.suites.suite_file import Run
 
 #: Path in ``Run.folder`` -> content of a file that is new or has changed, ``None`` of one that is gone.
@@ -80,6 +81,8 @@ def write_changes(run: Run, changes: Changes) -> None:
     for empty in (checkpoints / "blocks", checkpoints):
         if empty.is_dir() and not any(empty.iterdir()):
             empty.rmdir()
+    if run.run_folder.is_dir():
+        mark_as_own(run.run_folder)
 
 
 def _write_all(folder: Path, changes: Changes) -> None:

@@ -20,6 +20,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import softbody_envs  # noqa: F401  (registers its ids)
+from sb3_por.common import plain
 from sb3_por.common.errors import UserError, UserNote, one_line
 from sb3_por.common.files import DISK_ERRORS, DiskError, atomic_write, remove_unfinished
 from sb3_por.evaluation.episodes import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
@@ -50,6 +51,7 @@ from sb3_por.runs.folder import (
     write_settings,
 )
 from sb3_por.runs.lock import lock_folder
+from sb3_por.runs.origin import mark_as_own, note_foreign
 from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
 from sb3_por.training.full_disk import PatientLogs, keep_playing
 from sb3_por.training.trials import trial_settings
@@ -143,7 +145,9 @@ class Experiment(ExperimentManager):
         os.makedirs(self.params_path, exist_ok=True)
         self._folder_made = self._resumed_run is None
         self._lock = lock_folder(Path(self.save_path), f"another process is at work in {self.save_path}")
-        if self._resumed_run is not None:
+        if self._resumed_run is None:
+            mark_as_own(Path(self.save_path))
+        else:
             remove_unfinished(self._resumed_run)
             if self._checkpoint is not None:
                 restore_monitors(self._resumed_run, self._checkpoint)
@@ -153,7 +157,7 @@ class Experiment(ExperimentManager):
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
         Report settings that cannot work in one line, and leave no folder behind. Store in the model what its environment is
-        made of, so that its ``.zip`` can be evaluated alone.
+        made of, so that its ``.zip`` can be evaluated alone, and its plain description, so that it can be loaded safely.
         """
         try:
             experiment = super().setup_experiment()
@@ -169,6 +173,7 @@ class Experiment(ExperimentManager):
         if experiment is not None:
             model, settings = experiment
             TrainingEnvironment.of_settings(self.env_name.gym_id, settings).store_in(model)
+            setattr(model, plain.ATTRIBUTE, plain.describe(model))
         return experiment
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
@@ -223,6 +228,7 @@ class Experiment(ExperimentManager):
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         """Restore the replay buffer of a checkpoint, too, and draw other scenes than at the beginning of the run."""
+        note_foreign(Path(self.trained_agent))
         with quiet_n_steps():
             model = super()._load_pretrained_agent(hyperparams, env)
         model.policy.set_training_mode(True)  # a policy that this algorithm cannot train says so now

@@ -18,6 +18,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_por.acceleration.overlap import OverlappedTraining
 from sb3_por.acceleration.precision import check_precision
 from sb3_por.acceleration.updates import AcceleratedUpdates
+from sb3_por.common import plain
 from sb3_por.common.checks import check_ranges, check_types
 from sb3_por.common.errors import UserError
 from sb3_por.common.random_state import SavedRandomState
@@ -122,6 +123,8 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         self._acceleration = AcceleratedUpdates(self.policy, self.precision, self.compile_mode)
         self._augmentation = Augmentation(self.policy, self.augmentation_pad)
         self._metrics = RunningMeans()
+        # In the .zip, from which a stranger rebuilds the model without pickled code
+        setattr(self, plain.ATTRIBUTE, plain.describe(self))
 
     def _check_arguments(self) -> None:
         """

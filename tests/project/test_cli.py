@@ -11,6 +11,7 @@ import pytest
 from stable_baselines3 import SAC
 
 from sb3_por.__main__ import COMMANDS, main
+from sb3_por.runs.origin import mark_as_own
 
 ROOT = Path(__file__).parents[2]
 
@@ -20,6 +21,7 @@ def run(tmp_path_factory):
     """A run folder with a model and two evaluations."""
     folder = tmp_path_factory.mktemp("logs") / "sac" / "Pendulum-v1_3"
     folder.mkdir(parents=True)
+    mark_as_own(folder)
     SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, seed=0).save(folder / "best_model.zip")
     episodes = np.array([[0.1, 0.2], [0.5, 0.6]])
     np.savez(

@@ -35,8 +35,11 @@ class Command:
 
 
 def _model_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    which = parser.add_mutually_exclusive_group(required=required)
     models = "a .zip, a run folder (its best model), random, nothing, or expert"
-    parser.add_argument("--model", required=required, help=models)
+    which.add_argument("--model", help=models)
+    agent = "the trained agent that comes with the package; the best, or that of --algo"
+    which.add_argument("--pretrained", action="store_true", help=agent)
     parser.add_argument("--env", required=required, help="environment id")
     parser.add_argument("--algo", help="algorithm that saved the model, if it cannot be told from the file")
     safe = "run nothing that the model's file or folder holds: for models of strangers"
@@ -45,7 +48,8 @@ def _model_arguments(parser: argparse.ArgumentParser, required: bool = True) -> 
 
 def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     _model_arguments(parser)
-    parser.add_argument("-n", "--n-episodes", type=int, default=20, help="held-out episodes (default 20)")
+    episodes = "held-out episodes (default 20; with --pretrained those of the published scores)"
+    parser.add_argument("-n", "--n-episodes", type=int, help=episodes)
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--json", action="store_true", help="print every episode as JSON")
 
@@ -59,7 +63,12 @@ def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     if args.seed < 0:
         raise UserError(f"--seed must not be negative, got {args.seed}")
     is_reference = args.model in REFERENCES
-    args.env = find_environment(args.env, None if is_reference else args.model, args.safe)
+    args.env = find_environment(args.env, None if is_reference or args.pretrained else args.model, args.safe)
+    if args.pretrained:
+        from sb3_por.sharing.agents import find_agent
+
+        args.model = find_agent(args.env, args.algo).model
+        return resolve(args.model, args.env)
     if is_reference:
         return REFERENCES[args.model](args.env), {}
     return resolve(args.model, args.env, algo=args.algo, safe=args.safe)
@@ -69,11 +78,25 @@ def _evaluate(args: argparse.Namespace) -> None:
     from sb3_por.evaluation.evaluate import evaluate
 
     model, environment = _load(args)
+    published = _published(args) if args.pretrained else None
+    if args.n_episodes is None:
+        args.n_episodes = 20 if published is None else len(published.returns)
     evaluation = evaluate(model, args.env, args.n_episodes, args.seed, **environment)
     if args.json:
-        print(json.dumps({"model": args.model, "env": args.env, "seed": args.seed, **evaluation.as_dict()}, indent=2))
-    else:
-        print(evaluation)
+        shown = {"model": str(args.model), "env": args.env, "seed": args.seed, **evaluation.as_dict()}
+        print(json.dumps(shown | ({} if published is None else {"published": published.as_dict()}), indent=2))
+        return
+    print(evaluation)
+    if published is not None:
+        print(f"published: {published}")
+
+
+def _published(args: argparse.Namespace) -> Any:
+    """The agent's published scores, of the same episodes where they are the same."""
+    from sb3_por.sharing.agents import find_agent, read_evaluation
+
+    scores = find_agent(args.env, args.algo).facts["evaluation"]
+    return read_evaluation(scores, args.n_episodes if args.seed == scores["seed"] else None)
 
 
 def _enjoy_arguments(parser: argparse.ArgumentParser) -> None:
@@ -210,7 +233,8 @@ def _diagnose(args: argparse.Namespace) -> None:
 
     if args.csv:
         check_output(args.csv, (".csv",))
-    if bool(args.paths) == bool(args.model and args.env) or (args.csv and not args.paths):
+    one = (args.model or args.pretrained) and args.env
+    if bool(args.paths) == bool(one) or (args.csv and not args.paths):
         raise UserError("give --model and --env, or folders of runs and perhaps --csv (diagnose --help lists the arguments)")
     if args.paths:
         table = diagnose_runs(args.paths, args.n_episodes, args.seed, args.fresh_head)
@@ -223,7 +247,7 @@ def _diagnose(args: argparse.Namespace) -> None:
     check_order(model)
     diagnosis = diagnose(model, args.env, args.n_episodes, args.seed, **environment, fresh_head=args.fresh_head)
     if args.json:
-        print(json.dumps({"model": args.model, "env": args.env, "seed": args.seed, **diagnosis.as_dict()}, indent=2))
+        print(json.dumps({"model": str(args.model), "env": args.env, "seed": args.seed, **diagnosis.as_dict()}, indent=2))
     else:
         print(diagnosis)
 
@@ -282,6 +306,22 @@ def _report(args: argparse.Namespace) -> None:
     print(write_report(args.paths, args.output, args.metric, args.step, args.seed, videos=not args.no_videos))
 
 
+def _export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN", help="a run's folder")
+    parser.add_argument("-o", "--output", required=True, help="folder of agents, which gets <algo>-<env>.zip and .json")
+    parser.add_argument("-n", "--n-episodes", type=int, default=50, help="held-out episodes that score it (default 50)")
+    parser.add_argument("--last", action="store_true", help="the last model instead of the best")
+
+
+def _export(args: argparse.Namespace) -> None:
+    import softbody_envs  # noqa: F401  (registers its ids)
+    from sb3_por.sharing.export import export_run
+
+    agent = export_run(args.run, args.output, args.n_episodes, args.last)
+    print(agent.evaluation)
+    print(agent.model)
+
+
 COMMANDS = {
     "evaluate": Command(
         help="play held-out episodes and print the scores",
@@ -318,6 +358,12 @@ COMMANDS = {
         example="--model logs/sac_por/PourWater-v0_1 --env PourWater-v0 -o map.png",
         add_arguments=_saliency_arguments,
         run=_saliency,
+    ),
+    "export": Command(
+        help="write a run's model for others: without pickled code and optimizers, with its settings and scores",
+        example="logs/sac_por/PourWater-v0_1 -o agents",
+        add_arguments=_export_arguments,
+        run=_export,
     ),
     "suite": Command(
         help="run what is left to do of a grid of algorithms, environments and seeds",

@@ -18,6 +18,7 @@ from sb3_por.common.errors import UserError
 from sb3_por.evaluation.episodes import evaluation_episodes
 from sb3_por.evaluation.environment import make_evaluation_env
 from sb3_por.evaluation.loading import resolve
+from sb3_por.evaluation.safe_loading import LACKS_VALUES
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.runs.environment import EnvWrapper, VecEnvWrapper
 from sb3_por.runs.facts import run_identity
@@ -154,6 +155,8 @@ def diagnose(
     """
     model, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
     objective = check_order(model)
+    if getattr(model, LACKS_VALUES, False):
+        raise UserError("an exported model holds no Q networks, whose gradients a diagnosis measures; diagnose its run")
     if n_episodes < 1:
         raise UserError(f"a diagnosis needs at least 1 episode, got {n_episodes}")
     env = make_evaluation_env(model, env_id, **environment)

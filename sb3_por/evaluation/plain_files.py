@@ -86,14 +86,14 @@ def read_tensors(path: Path) -> dict[str, th.Tensor]:
     return dict(tensors)
 
 
-def save_plain(model: BaseAlgorithm, path: Path, statistics: VecNormalize | None = None) -> None:
+def save_plain(model: BaseAlgorithm, path: Path, statistics: dict[str, Any] | None = None) -> None:
     """
     Save what playing needs: description, environment and networks without those of the values; no optimizer, no pickled code.
     ``load_safe`` reads it, SB3's ``load`` does not.
 
     :param model: A model
     :param path: ``.zip`` to write
-    :param statistics: ``VecNormalize`` statistics that the model plays with
+    :param statistics: ``VecNormalize`` statistics that the model plays with, see ``describe_statistics``
     """
     stored = {name: vars(model)[name] for name in (environment.ATTRIBUTE, "num_timesteps") if name in vars(model)}
     tensors = {
@@ -106,7 +106,7 @@ def save_plain(model: BaseAlgorithm, path: Path, statistics: VecNormalize | None
         archive.writestr(POLICY, networks.getvalue())
         archive.writestr("_stable_baselines3_version", stable_baselines3.__version__)
         if statistics is not None:
-            archive.writestr(STATISTICS, json.dumps(describe_statistics(statistics)))
+            archive.writestr(STATISTICS, json.dumps(statistics))
 
 
 def lacks_values(names: set[str]) -> bool:

@@ -46,6 +46,8 @@ WRAPPERS = (
     "sb3_contrib.common.wrappers.TimeFeatureWrapper",
     "stable_baselines3.common.vec_env.VecFrameStack",
 )
+#: Attribute of a model whose file holds no Q networks, so that its own are as they were initialized
+LACKS_VALUES = "lacks_values"
 #: Most parameters of a policy, and most tensors of them: a number in a file cannot fill the memory
 MAX_PARAMETERS, MAX_PARAMETER_TENSORS = 2**26, 10_000
 
@@ -200,6 +202,7 @@ def _load_networks(model: BaseAlgorithm, tensors: dict[str, th.Tensor]) -> None:
         names = sorted(unexpected or missing)
         raise ValueError(f"{len(names)} tensors do not fit a {type(model.policy).__name__}, {names[0]!r:.80} among them")
     model.policy.load_state_dict({**own, **tensors})
+    vars(model)[LACKS_VALUES] = bool(missing)
 
 
 @contextmanager

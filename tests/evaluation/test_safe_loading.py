@@ -422,7 +422,7 @@ def normalized():
 
 def test_statistics_have_a_plain_form(normalized, tmp_path):
     model, env = normalized
-    save_plain(model, tmp_path / "plain.zip", env)
+    save_plain(model, tmp_path / "plain.zip", plain_files.describe_statistics(env))
     env.save(str(tmp_path / "vecnormalize.pkl"))
     expected = evaluate(model, "Pendulum-v1", 1, vec_normalize=str(tmp_path / "vecnormalize.pkl"))
     assert evaluate(tmp_path / "plain.zip", "Pendulum-v1", 1) == expected
@@ -457,7 +457,7 @@ def test_pickled_statistics_are_refused_by_name(normalized, tmp_path, marker):
 )
 def test_statistics_that_are_none_are_refused(described, normalized, tmp_path):
     model, env = normalized
-    save_plain(model, tmp_path / "plain.zip", env)
+    save_plain(model, tmp_path / "plain.zip", plain_files.describe_statistics(env))
     rewrite(tmp_path / "plain.zip", tmp_path / "hostile.zip", {"vecnormalize.json": json.dumps(described)})
     with pytest.raises(UserError, match="these are no statistics of VecNormalize"):
         make_evaluation_env(model, "Pendulum-v1", vec_normalize=str(tmp_path / "hostile.zip"))

@@ -18,6 +18,7 @@ LAYERS = (
     "evaluation",
     "training",
     "analysis",
+    "sharing",
     "suites",
 )
 FILES = [*ROOT.glob("sb3_por/*/*.py"), *ROOT.glob("softbody_envs/**/*.py")]

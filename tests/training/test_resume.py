@@ -118,7 +118,7 @@ def assert_finished(run):
     models = {f"rl_model_{step}_steps.zip" for step in range(50, N_STEPS, 50)}
     settings = {f"Pendulum-v1/{name}" for name in ("args.yml", "config.yml", "command.txt")}
     others = {"0.monitor.csv", "Pendulum-v1.zip", "best_model.zip", "evaluations.npz", "replay_buffer.pkl"}
-    assert files - {".lock"} == models | settings | others
+    assert files - {".lock", ".origin"} == models | settings | others
     model = load_model(run / "Pendulum-v1.zip")
     assert model.num_timesteps == N_STEPS and model._n_updates == N_STEPS - 50
     for network in (model.actor, model.critic):

@@ -56,7 +56,7 @@ def test_a_run_leaves_the_zoos_files(finished_run):
         "Pendulum-v1/command.txt",
     }
     assert list(finished_run.glob("tb/SAC_1/events*"))
-    assert {name for name in files if "/." in f"/{name}"} <= {".lock"}
+    assert {name for name in files if "/." in f"/{name}"} <= {".lock", ".origin"}
     assert not (finished_run / "checkpoint").exists()
     assert load_model(finished_run / "Pendulum-v1.zip").num_timesteps == 400
 

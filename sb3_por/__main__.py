@@ -42,6 +42,10 @@ def _model_arguments(parser: argparse.ArgumentParser, required: bool = True) -> 
     which.add_argument("--pretrained", action="store_true", help=agent)
     parser.add_argument("--env", required=required, help="environment id")
     parser.add_argument("--algo", help="algorithm that saved the model, if it cannot be told from the file")
+    _safe_argument(parser)
+
+
+def _safe_argument(parser: argparse.ArgumentParser) -> None:
     safe = "run nothing that the model's file or folder holds: for models of strangers"
     parser.add_argument("--safe", action="store_true", help=safe)
 
@@ -127,6 +131,7 @@ def _record_arguments(parser: argparse.ArgumentParser) -> None:
     from sb3_por.training.arguments import Settings
 
     parser.add_argument("--model", required=True, help="expert, a .zip, or a run folder (its best model)")
+    _safe_argument(parser)
     parser.add_argument("--env", required=True, help="environment id")
     algo = (
         "record in the environment that the settings of this algorithm make (default: that of the model; sac_por's for expert)"
@@ -149,13 +154,13 @@ def _record(args: argparse.Namespace) -> None:
 
     if args.seed < 0:
         raise UserError(f"--seed must not be negative, got {args.seed}")
-    env_id = find_environment(args.env, None if args.model == EXPERT else args.model)
+    env_id = find_environment(args.env, None if args.model == EXPERT else args.model, args.safe)
     algo = args.algo or ("sac_por" if args.model == EXPERT else None)
     if algo is None and (args.conf_file or args.hyperparams or args.env_kwargs):
         raise UserError("-conf, -params and --env-kwargs are about the settings of an algorithm: give --algo, too")
     changes = args.conf_file, args.hyperparams, args.env_kwargs
     made_of = None if algo is None else settings_environment(algo, env_id, *changes)
-    print(record(args.model, env_id, args.output, args.n_episodes, args.seed, made_of))
+    print(record(args.model, env_id, args.output, args.n_episodes, args.seed, made_of, args.safe))
     print(args.output)
 
 

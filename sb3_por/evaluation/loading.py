@@ -18,9 +18,10 @@ from sb3_por.evaluation import plain_files
 from sb3_por.evaluation.environment import make_wrapped, observation_kwargs
 from sb3_por.evaluation.episodes import Model, whole_episodes
 from sb3_por.evaluation.model_files import LOADABLE, candidates, model_file, read_data
-from sb3_por.evaluation.safe_loading import check_environment, is_plain, load_safe
+from sb3_por.evaluation.safe_loading import check_environment, failing_in_one_line, is_plain, load_safe
 from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, VecEnvWrapper, import_wrappers
 from sb3_por.runs.folder import (
+    ARGUMENTS,
     BEST_MODEL,
     BEST_STATISTICS,
     HYPERPARAMETERS,
@@ -105,8 +106,13 @@ def resolve(
         path = model_file(model)
         safe = safe or is_plain(read_data(path))
         find_environment(env_id, path, safe)
-        environment = trained_in(path, env_id, safe)
-        model = _load_safe(path, env_id, environment, algo) if safe else load_model(path, algo)
+        if safe:
+            with failing_in_one_line(path):
+                environment = trained_in(path, env_id, safe=True)
+                model = _load_safe(path, env_id, environment, algo)
+        else:
+            environment = trained_in(path, env_id)
+            model = load_model(path, algo)
     else:
         quiet = bool(given) or env_kwargs is not None
         environment = _arguments(TrainingEnvironment.of_model(model), env_id, None, quiet)

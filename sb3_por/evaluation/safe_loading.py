@@ -70,11 +70,22 @@ def load_safe(
     :raises UserError: If something in the file is not plain, not known or too large; names it
     """
     path = model_file(path)
-    try:
+    with failing_in_one_line(path):
         return _load(path, env, device, algo)
+
+
+@contextmanager
+def failing_in_one_line(path: Path) -> Iterator[None]:
+    """
+    A stranger's file may fail in any way; none of them is worth a traceback.
+
+    :param path: File that is read inside
+    :raises UserError: If anything is raised inside
+    """
+    try:
+        yield
     except UserError:
         raise
-    # A stranger's file may fail in any way; none of them is worth a traceback.
     except Exception as error:
         raise UserError(f"{path} cannot be loaded safely: {one_line(error)[:200]}") from error
 

@@ -120,6 +120,7 @@ def record(
     n_episodes: int,
     seed: int = 0,
     made_of: TrainingEnvironment | None = None,
+    safe: bool = False,
 ) -> Evaluation:
     """
     Record episodes of training scenes, never of held-out ones, as a Minari dataset. What is recorded is what the environment
@@ -132,13 +133,14 @@ def record(
     :param seed: Chooses the scenes; episode k is reset with ``seed + k``
     :param made_of: Parts of the environment; by default those that the model was trained in, and for the expert those of
         ``sac_por``
+    :param safe: Run nothing that the model's file or folder holds
     :return: The scores of the episodes
     :raises UserError: If the model or the environment cannot be made, or the folder cannot be written
     """
     if n_episodes < 1:
         raise UserError(f"a recording needs at least 1 episode, got {n_episodes}")
     check_new(path)
-    loaded, environment = (None, {}) if model == EXPERT else resolve(model, env_id)
+    loaded, environment = (None, {}) if model == EXPERT else resolve(model, env_id, safe=safe)
     if made_of is None and loaded is None:
         made_of = settings_environment("sac_por", env_id)
     if made_of is not None:

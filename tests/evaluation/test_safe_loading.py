@@ -21,7 +21,7 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from toy_envs import DotEnv
 
-from sb3_por import SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ
+from sb3_por import SACCURL, SACMRQ, SACPOR, SACSPR, TQCPOR, SACDrQ
 from sb3_por.__main__ import main
 from sb3_por.common import plain
 from sb3_por.common.errors import UserError, UserNote
@@ -100,7 +100,7 @@ def actions(model):
     return model.predict(batches, deterministic=True)[0]
 
 
-@pytest.mark.parametrize("cls", [SACPOR, TQCPOR, SACDrQ, SACCURL, SACSPR])
+@pytest.mark.parametrize("cls", [SACPOR, TQCPOR, SACDrQ, SACCURL, SACSPR, SACMRQ])
 @pytest.mark.parametrize("obs_type", ["pixels", "state", "dict"])
 def test_own_models_are_rebuilt_from_their_description(cls, obs_type, tmp_path):
     policy = {"pixels": "CnnPolicy", "state": "MlpPolicy", "dict": "MultiInputPolicy"}[obs_type]
@@ -463,11 +463,12 @@ def test_statistics_that_are_none_are_refused(described, normalized, tmp_path):
         make_evaluation_env(model, "Pendulum-v1", vec_normalize=str(tmp_path / "hostile.zip"))
 
 
-@pytest.mark.parametrize("command", ["evaluate", "enjoy", "diagnose", "saliency"])
-def test_safe_is_an_argument_of_every_command_with_a_model(command, sac_zip, tmp_path, marker, capsys):
+@pytest.mark.parametrize("command", ["evaluate", "enjoy", "diagnose", "saliency", "record"])
+def test_safe_is_an_argument_of_every_command_with_a_model(command, sac_zip, tmp_path, marker, capsys, monkeypatch):
     hostile = rewrite(sac_zip, tmp_path / "hostile.zip", data={"policy_kwargs": serialized(Touch(marker))})
-    output = {"enjoy": ["-o", str(tmp_path / "v.gif")], "saliency": ["-o", str(tmp_path / "s.png")]}.get(command, [])
-    assert main([command, "--model", str(hostile), "--env", "Pendulum-v1", "--safe", *output]) == 2
+    outputs = {"enjoy": ["-o", "v.gif"], "saliency": ["-o", "s.png"], "record": ["-n", "1", "-o", "dataset"]}
+    monkeypatch.chdir(tmp_path)
+    assert main([command, "--model", str(hostile), "--env", "Pendulum-v1", "--safe", *outputs.get(command, [])]) == 2
     assert "hostile.zip cannot be loaded safely: " in capsys.readouterr().err
     assert not marker.exists()
 

@@ -81,6 +81,11 @@ def test_constraints_pin_what_is_declared_within_its_range(options):
         assert pin.operator == "==" and requirement.specifier.contains(pin.version), name
 
 
+def test_the_page_of_installation_lists_the_extras(options):
+    listed = re.findall(r"^\| `(\w+)` \| ", (ROOT / "docs" / "install.md").read_text(), re.MULTILINE)
+    assert set(options["options.extras_require"]) <= set(listed)
+
+
 @pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13"])
 @pytest.mark.parametrize("system, machine", [("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")])
 def test_one_pybullet_is_chosen_everywhere(options, system, machine, version):

@@ -17,6 +17,8 @@ from sb3_por.common.files import check_writable
 
 #: File that Minari keeps in every dataset
 METADATA = "metadata.json"
+#: Arguments of an environment that change neither what an action does nor what it earns
+IRRELEVANT = {"obs_type", "image_size", "split", "renderer", "render_mode", "render_size"}
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,8 @@ class Demonstrations:
             raise UserError(f"the Minari dataset {self.path} has no episodes")
         self.observation_space: spaces.Space = self._dataset.observation_space
         self.action_space: spaces.Space = self._dataset.action_space
+        #: Gymnasium's specification of the environment; None if nobody has recorded it
+        self.spec: EnvSpec | None = self._dataset.env_spec
 
     def __len__(self) -> int:
         """:return: Number of episodes"""
@@ -146,6 +150,17 @@ def write_demonstrations(
         temporary.rename(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def describe(spec: EnvSpec) -> str:
+    """
+    :param spec: Gymnasium's specification of an environment
+    :return: Its id, its arguments and its wrappers as far as their arguments are known, without what spaces tell and what
+        decides the scenes, the length of an episode and how it is shown
+    """
+    kwargs = {name: value for name, value in sorted(spec.kwargs.items()) if name not in IRRELEVANT}
+    wrappers = [f"{one.name} {one.kwargs}" for one in spec.additional_wrappers if one.kwargs]
+    return " in ".join([f"{spec.id} {kwargs}", *wrappers])
 
 
 def check_new(path: str | Path) -> None:

@@ -7,6 +7,7 @@ import warnings
 from typing import Any, ClassVar
 
 import torch as th
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -20,10 +21,10 @@ from sb3_por.acceleration.precision import check_precision
 from sb3_por.acceleration.updates import AcceleratedUpdates
 from sb3_por.common import plain
 from sb3_por.common.checks import check_ranges, check_types
-from sb3_por.common.errors import UserError
+from sb3_por.common.errors import UserError, UserNote
 from sb3_por.common.random_state import SavedRandomState
 from sb3_por.common.running_means import RunningMeans
-from sb3_por.demonstrations.dataset import Demonstrations
+from sb3_por.demonstrations.dataset import Demonstrations, describe
 from sb3_por.demonstrations.playback import fill, n_transitions
 from sb3_por.objectives.base import Objective
 from sb3_por.visual.batch import Augmentation
@@ -234,7 +235,18 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
             **self.replay_buffer_kwargs,
         )
         fill(buffer, demonstrations)
+        self._compare_environments(demonstrations.spec)
         self.demos, self.demo_buffer = str(path), buffer
+
+    def _compare_environments(self, recorded: EnvSpec | None) -> None:
+        """Note it if demonstrations are from an environment whose actions or rewards may mean something else."""
+        trained: EnvSpec | None = self.env.get_attr("spec", 0)[0] if self.env is not None else None
+        if recorded is not None and trained is not None and describe(recorded) != describe(trained):
+            warnings.warn(
+                f"the demonstrations were made in {describe(recorded)}, and training is in {describe(trained)}: actions and "
+                "rewards may mean something else",
+                UserNote,
+            )
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from toy_envs import DotEnv
 
 from sb3_por import SACCURL, SACPOR, SACSPR, TQCPOR, SACDrQ, VisualSAC
-from sb3_por.common.errors import UserError
+from sb3_por.common.errors import UserError, UserNote
 from sb3_por.demonstrations.dataset import RecordedEpisode, write_demonstrations
 from sb3_por.training.zoo import main
+from softbody_envs.wrappers import ActionRepeat
 
 pytest.importorskip("minari", reason="pip install 'sb3-por[demos]'")
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
@@ -225,6 +227,20 @@ def test_what_does_not_fit_is_one_clear_error(tmp_path):
         make_model(VisualSAC, goal_env, "MultiInputPolicy", policy_kwargs={}, replay_buffer_class=HerReplayBuffer).load_demos(
             tmp_path
         )
+
+
+def test_demonstrations_of_another_environment_are_noted(tmp_path, recwarn):
+    def made(repeat, **kwargs):
+        return ActionRepeat(gym.make("Pendulum-v1", **kwargs), repeat)
+
+    env = made(5, max_episode_steps=20)
+    write_demonstrations(tmp_path / "demos", play(env, 1), env.observation_space, env.action_space, env.spec)
+    for same in (made(5), Monitor(made(5))):
+        make_model(VisualSAC, same, "MlpPolicy").load_demos(tmp_path / "demos")
+    assert not [warning for warning in recwarn if issubclass(warning.category, UserNote)]
+    for other in (made(4), made(5, g=9.0), gym.make("Pendulum-v1")):
+        with pytest.warns(UserNote, match="actions and rewards may mean something else"):
+            make_model(VisualSAC, other, "MlpPolicy").load_demos(tmp_path / "demos")
 
 
 FLAGS = ["--algo", "sac_drq", "--env", "Pendulum-v1", "-n", "60", "--seed", "1", "--eval-freq", "-1", "--save-freq", "25"]

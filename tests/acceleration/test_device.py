@@ -32,10 +32,12 @@ def on_device():
 
 
 def train(device, cls="SACPOR", policy="CnnPolicy", obs_type="pixels", **options):
-    """A model after two episodes; the second one is learned from."""
+    """A model after two episodes; the second one is learned from. If it clones, then what it has played itself."""
     arguments = dict(policy_kwargs=SIZES, buffer_size=50, learning_starts=20, batch_size=8, diagnostics_interval=3, seed=0)
     env = DotEnv(size=20, falling=True, obs_type=obs_type)
-    return getattr(sb3_por, cls)(policy, env, device=device, **{**arguments, **options}).learn(40)
+    model = getattr(sb3_por, cls)(policy, env, device=device, **{**arguments, **options})
+    model.demo_buffer = model.replay_buffer if model.bc_coef > 0 else None
+    return model.learn(40)
 
 
 def numbers(model):
@@ -69,6 +71,7 @@ def train_on_both(**options):
         dict(cls="SACCURL"),
         dict(cls="SACSPR"),
         dict(cls="SACMRQ"),
+        dict(cls="SACSPR", n_steps=3, bc_coef=1.0),
         dict(cls="TQCPOR"),
         dict(n_steps=3, start_at_mean_reward=True, reward_scale=20.0),
         dict(use_sde=True),

@@ -27,6 +27,7 @@ class Suite:
     :param eval_freq: steps between two evaluations
     :param eval_episodes: episodes of an evaluation
     :param save_freq: steps between two checkpoints
+    :param demos: folder of demonstrations, ``<demos>/<environment>``; none if ``None``
     :param hyperparams: changes to the settings of all runs
     :param variants: name -> the algorithm (``algo``) that runs under this name, and changes to its settings
     :param overrides: algorithm, environment, or ``algorithm/environment`` -> changes to the settings of its runs
@@ -43,6 +44,7 @@ class Suite:
     eval_freq: int = 2000
     eval_episodes: int = 10
     save_freq: int = 10_000
+    demos: str | None = None
     hyperparams: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
     overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -122,7 +124,8 @@ def suite_runs(suite: Suite, root: Path) -> list[Run]:
                 for key in narrow:
                     changes |= suite.overrides.get(key, {})
                 params = ["-params", *(f"{name}:{value!r}" for name, value in changes.items())] if changes else []
-                flags = [*common, "--num-threads", str(suite.threads), *packages, *params]
+                demos = ["--demos", str(Path(suite.demos) / env)] if suite.demos is not None else []
+                flags = [*common, "--num-threads", str(suite.threads), *packages, *demos, *params]
                 folder = root / env / name / f"seed_{seed}"
                 runs.append(Run(algo, env, seed, folder, tuple(flags), variant=name if name in suite.variants else ""))
     return runs
@@ -251,6 +254,9 @@ class _Checks:
             inner = value.values() if name != "hyperparams" and isinstance(value, dict) else []
             if not all(isinstance(one, dict) for one in [value, *inner]):
                 self._fail(node, f"{name} must be a mapping, such as {_EXAMPLES[name]}")
+        elif name == "demos":
+            if not isinstance(value, str):
+                self._fail(node, f"demos must be a folder such as demos, got {value!r}")
         elif name == "gpus":
             if type(value) not in (int, float) or not value >= 0:
                 self._fail(node, f"gpus must be a number such as 1 or 0.5, got {value!r}")

@@ -33,12 +33,15 @@ EXAMPLE = """example:
 
   python train.py --algo sac_por --env PourWater-v0 -n 20000 -optimize --n-trials 50 --study-name pour --storage tuning.log
 
-Settings come from zoo_hyperparams/<algo>.yml, else from the RL Zoo's file of the algorithm. The run goes to
-<log-folder>/<algo>/<env>_<n>: best_model.zip, evaluations.npz, checkpoints, tb/ for TensorBoard."""
+Settings come from zoo_hyperparams/<algo>.yml (with --demos from demos.yml there), else from the RL Zoo's file of the
+algorithm. The run goes to <log-folder>/<algo>/<env>_<n>: best_model.zip, evaluations.npz, checkpoints, tb/ for TensorBoard."""
 
 
 #: Our defaults of the zoo's flags, where they differ.
 DEFAULTS = {"algo": "sac_por", "env": "PourWater-v0", "eval_freq": 2000, "save_freq": 10_000}
+
+#: File of the settings of all algorithms that learn from demonstrations.
+DEMOS = "demos.yml"
 
 
 class Settings(StoreDict):
@@ -106,7 +109,7 @@ class Parser(argparse.ArgumentParser):
         if args.trained_agent:
             args.trained_agent = str(model_file(args.trained_agent))
             read_data(Path(args.trained_agent))
-        args.conf_file = args.conf_file or str(hyperparameter_file(args.algo, args.env))
+        args.conf_file = args.conf_file or str(hyperparameter_file(args.algo, args.env, bool(args.demos)))
         if args.conf_file.endswith((".yml", ".yaml")):
             _check_hyperparameters(Path(args.conf_file), args.env)
         check_writable(args.log_folder)
@@ -139,14 +142,19 @@ class Parser(argparse.ArgumentParser):
         return args
 
 
-def hyperparameter_file(algo: str, env_id: str) -> Path:
+def hyperparameter_file(algo: str, env_id: str, demos: bool = False) -> Path:
     """
     The settings of an algorithm for an environment: ours where we list it, else the zoo's, else our default.
 
-    :raises UserError: if none fits
+    :param algo: Name of an algorithm
+    :param env_id: Gymnasium id
+    :param demos: Whether it learns from demonstrations: then those of ``demos.yml``, for every algorithm, where we list the
+        environment there
+    :return: The file
+    :raises UserError: If none fits
     """
     folders = shipped("zoo_hyperparams"), Path(rl_zoo3.__file__).parent / "hyperparams"
-    files = [folder / f"{algo}.yml" for folder in folders]
+    files = [*([folders[0] / DEMOS] if demos else []), *(folder / f"{algo}.yml" for folder in folders)]
     entries = {file: yaml.safe_load(file.read_text()) for file in files if file.is_file()}
     for key in (env_id, "default"):
         for file, settings in entries.items():

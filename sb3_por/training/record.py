@@ -100,10 +100,10 @@ def settings_environment(
     :param conf_file: Settings in the RL Zoo's format; the file that ``train.py`` would choose by default
     :param changes: Changes to the settings
     :param env_kwargs: Changes to the arguments of the environment
-    :return: The environment that ``train.py`` would train in
+    :return: The environment that ``train.py --demos`` would train in
     :raises UserError: If there are no settings
     """
-    file = Path(conf_file) if conf_file else hyperparameter_file(algo, env_id)
+    file = Path(conf_file) if conf_file else hyperparameter_file(algo, env_id, demos=True)
     try:
         settings = yaml.safe_load(file.read_text())
         settings = {**(settings[env_id] if env_id in settings else settings["default"]), **(changes or {})}

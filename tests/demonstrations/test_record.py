@@ -19,7 +19,7 @@ from sb3_por.runs.environment import TrainingEnvironment
 from sb3_por.training.record import record
 from softbody_envs.experts.pour_water import PourWaterExpert
 from softbody_envs.variations import SPLITS
-from softbody_envs.wrappers import ActionRepeat
+from softbody_envs.wrappers import ActionRepeat, ProgressReward
 
 minari = pytest.importorskip("minari", reason="pip install 'sb3-por[demos]'")
 
@@ -38,10 +38,12 @@ def test_the_expert_is_recorded_in_the_environment_of_the_settings(poured):
     dataset = minari.MinariDataset(path)
     assert dataset.total_episodes == 2 and dataset.observation_space.shape == (64, 64, 3)
     env = dataset.recover_environment()
-    assert isinstance(env, ActionRepeat) and (env.repeat, env.scale) == (10, 0.7)
-    for episode, variation, total in zip(dataset, evaluation.variations, evaluation.returns, strict=True):
-        assert len(episode.actions) == 10 and episode.truncations.tolist() == [False] * 9 + [True]
-        assert not episode.terminations.any() and np.sum(episode.rewards) == pytest.approx(total, abs=1e-5)
+    assert isinstance(env, ProgressReward) and isinstance(env.env, ActionRepeat)
+    assert (env.env.repeat, env.env.scale) == (5, 0.7)
+    for episode, variation, score in zip(dataset, evaluation.variations, evaluation.normalized_performance, strict=True):
+        assert len(episode.actions) == 20 and episode.truncations.tolist() == [False] * 19 + [True]
+        # The whole progress, times 10, is the score
+        assert not episode.terminations.any() and np.sum(episode.rewards) == pytest.approx(10 * score, abs=1e-5)
         observation, _ = env.reset(options={"variation": variation})
         for t, action in enumerate(episode.actions):
             assert np.array_equal(episode.observations[t], observation), "stored without loss"
@@ -51,9 +53,9 @@ def test_the_expert_is_recorded_in_the_environment_of_the_settings(poured):
 
 
 def test_a_recording_is_learned_from_in_the_same_environment(poured):
-    env = ActionRepeat(gym.make("PourWater-v0", image_size=64), 10, 0.7)
+    env = ProgressReward(ActionRepeat(gym.make("PourWater-v0", image_size=64), 5, 0.7))
     model = SACPOR("CnnPolicy", env, buffer_size=50, demos=str(poured[0]), learning_starts=3, batch_size=4).learn(4)
-    assert model.demo_buffer.size() == 20 and model.demo_buffer.timeouts.sum() == 2
+    assert model.demo_buffer.size() == 40 and model.demo_buffer.timeouts.sum() == 2
 
 
 def test_record_from_the_shell(tmp_path, capsys):
@@ -61,9 +63,9 @@ def test_record_from_the_shell(tmp_path, capsys):
     flags = ["--model", "expert", "--env", "StraightenRope-v0", "-n", "1", "-o", str(path)]
     assert main(["record", *flags, "--algo", "sac_drq", "--env-kwargs", "obs_type:dict", "image_size:32"]) == 0
     line, where = capsys.readouterr().out.splitlines()
-    assert "success 100%" in line and "length 30 (1 episode)" in line and where == str(path)
+    assert "success 100%" in line and "length 15 (1 episode)" in line and where == str(path)
     (episode,) = Demonstrations(path).episodes()
-    assert episode.observations["image"].shape == (31, 32, 32, 3) and episode.observations["state"].shape[0] == 31
+    assert episode.observations["image"].shape == (16, 32, 32, 3) and episode.observations["state"].shape[0] == 16
     assert main(["record", *flags]) == 2
     assert "exists; give a new folder" in capsys.readouterr().err
 

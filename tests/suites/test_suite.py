@@ -70,6 +70,12 @@ def test_a_variant_is_an_algorithm_with_settings_and_a_name(suite_file, tmp_path
     assert "--algo sac_por" in command and "--label por_paper" in command
 
 
+def test_each_run_has_the_demonstrations_of_its_environment(suite_file, tmp_path):
+    text = "algos: [sac_por]\nenvs: [PourWater-v0, FoldCloth-v0]\nseeds: [0]\ndemos: of_experts\n"
+    for run in suite_runs(read_suite(suite_file(text)), tmp_path):
+        assert " ".join(run.flags).endswith(f"--demos {Path('of_experts') / run.env}")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -92,6 +98,10 @@ def test_a_variant_is_an_algorithm_with_settings_and_a_name(suite_file, tmp_path
         (
             "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\ngym_packages: [no_such_package]\n",
             "cannot import the package no_such_package",
+        ),
+        (
+            "algos: [sac]\nenvs: [Pendulum-v1]\nseeds: [0]\ndemos: 3\n",
+            "grid.yml:4: demos must be a folder such as demos, got 3",
         ),
         ("algos: [sac\n", "grid.yml:2: this is not YAML: expected ',' or ']'"),
         ("- sac\n", "grid.yml:1: a suite is a mapping, of at least these lines: algos: [sac_por, sac]; envs:"),

@@ -1,6 +1,7 @@
 """One run of train.py: the RL Zoo's ExperimentManager with evaluation, checkpoints and messages of ours."""
 
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -256,7 +257,7 @@ class Experiment(ExperimentManager):
         write_settings(Path(self.params_path) / ARGUMENTS, dict(sorted({**vars(self.args), "resume": None}.items())))
         if self._resumed_run is None:
             with atomic_write(Path(self.params_path) / COMMAND) as path:
-                path.write_text(" ".join(sys.orig_argv))
+                path.write_text(shlex.join(sys.orig_argv))
         print(f"Log path: {self.save_path}")
 
     def learn(self, model: BaseAlgorithm) -> None:

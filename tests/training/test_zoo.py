@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -69,6 +70,19 @@ def test_settings_are_plain_yaml_that_the_zoo_reads(finished_run):
     assert config["learning_starts"] == 50 and config["policy"] == "MlpPolicy"
     assert get_trained_models(str(finished_run.parent.parent)) == {"sac-Pendulum-v1": ("sac", "Pendulum-v1")}
     assert get_saved_hyperparams(str(finished_run / "Pendulum-v1"))[0]["normalize"] is False
+
+
+def test_the_command_can_be_typed_again(tmp_path, monkeypatch):
+    typed = [
+        "python",
+        "train.py",
+        *PENDULUM,
+        "-params",
+        "env_wrapper:[{'gymnasium.wrappers.TimeLimit': {'max_episode_steps': 9}}]",
+    ]
+    monkeypatch.setattr(sys, "orig_argv", typed)
+    assert main([*typed[2:-2], "-n", "10", "--eval-freq", "0", "-f", str(tmp_path)]) == 0
+    assert shlex.split((tmp_path / "sac" / "Pendulum-v1_1" / "Pendulum-v1" / "command.txt").read_text()) == typed
 
 
 def test_evaluations_are_regular_and_include_the_end(finished_run):

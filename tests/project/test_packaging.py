@@ -55,7 +55,7 @@ def test_every_package_is_listed(options):
 
 def test_every_import_is_a_declared_dependency(options):
     extras = options["options.extras_require"]
-    optional = [extras[name] for name in ("ray", "human", "demos")]
+    optional = [extras[name] for name in ("ray", "human", "demos", "hub")]
     declared = set(requirements("\n".join([options["options"]["install_requires"], *optional])))
     imported = set()
     for file in (file for package in PACKAGES for file in (ROOT / package).rglob("*.py")):

@@ -111,8 +111,12 @@ class FixedEpisodes(gym.Wrapper):
         self._next = 0
 
     def play(self, episodes: list[Episode]) -> None:
-        """The next ``reset`` begins the first of these."""
-        self._episodes = episodes
+        """
+        The next ``reset`` begins the first of these.
+
+        :param episodes: Episodes; an environment that has none to play, beside others that have, keeps its earlier ones
+        """
+        self._episodes = episodes or self._episodes
         self._next = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

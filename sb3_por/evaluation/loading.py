@@ -202,7 +202,7 @@ def import_packages(names: Iterable[str]) -> None:
     for name in names:
         try:
             importlib.import_module(name)
-        except ImportError as error:
+        except (ImportError, TypeError, ValueError) as error:  # no name of a module
             raise UserError(f"cannot import the package {name}: {one_line(error)}") from error
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import math
 import os
 import sys
 import warnings
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import rl_zoo3.train
+import torch as th
 import yaml
 from rl_zoo3 import ALGOS
 from rl_zoo3.utils import StoreDict
@@ -44,6 +46,23 @@ DEFAULTS = {"algo": "sac_por", "env": "PourWater-v0", "eval_freq": 2000, "save_f
 DEMOS = "demos.yml"
 
 
+#: Smallest and largest value of the flags with numbers that are not free; -1 stands for the zoo's default, where it has one
+RANGES = {
+    "n_timesteps": (1, math.inf),
+    "eval_episodes": (1, math.inf),
+    "n_eval_envs": (1, math.inf),
+    "n_trials": (1, math.inf),
+    "max_total_trials": (1, math.inf),
+    "n_evaluations": (1, math.inf),
+    "n_startup_trials": (0, math.inf),
+    "n_jobs": (1, math.inf),
+    "num_threads": (1, math.inf),
+    "seed": (0, 2**32 - 1),
+}
+#: Flags of which -1 is a value
+WITH_DEFAULT = ("n_timesteps", "n_jobs", "num_threads", "seed")
+
+
 class Settings(StoreDict):
     """``key:value`` pairs whose values are Python, as in the zoo, or else plain words: ``pairing:paper``."""
 
@@ -57,11 +76,13 @@ class Settings(StoreDict):
                 key, _, word = pair.partition(":")
                 if word.isidentifier() and callable(stored[key]):
                     stored[key] = word  # obs_type:dict means the word, not Python's dict
-            except (NameError, SyntaxError):
+            except (NameError, SyntaxError):  # no Python: a word
                 key, colon, word = pair.partition(":")
                 if not colon or not word:
                     parser.error(f"{option_string} takes key:value pairs, got {pair!r}")
                 stored[key] = word
+            except (Exception, SystemExit) as error:
+                parser.error(f"{option_string} {pair}: {type(error).__name__}: {one_line(error)}")
         setattr(namespace, self.dest, stored)
 
 
@@ -97,10 +118,9 @@ class Parser(argparse.ArgumentParser):
         args = super().parse_args()
         if args.resume:
             return self._resumed(Path(args.resume))
+        self._check(args)
         if args.trial_id is not None and not (args.storage and args.study_name):
             raise UserError("--trial-id needs the --storage and the --study-name of the search")
-        if args.track and importlib.util.find_spec("wandb") is None:
-            raise UserError("--track needs Weights & Biases: pip install wandb")
         check_known("algorithm", args.algo, ALGOS)
         if args.demos and args.algo not in ALGORITHMS:
             raise UserError(f"{args.algo} cannot learn from demonstrations; --demos needs one of {', '.join(ALGORITHMS)}")
@@ -113,11 +133,30 @@ class Parser(argparse.ArgumentParser):
         if args.conf_file.endswith((".yml", ".yaml")):
             _check_hyperparameters(Path(args.conf_file), args.env)
         check_writable(args.log_folder)
+        if args.tensorboard_log:
+            check_writable(args.tensorboard_log)
         _choose_threads(args)
         args.commit = current_commit()
         args.machine = current_machine()
         args.provenance = current_provenance(args.num_threads)
         return args
+
+    def _check(self, args: argparse.Namespace) -> None:
+        """
+        :raises UserError: If a flag cannot be used, whatever the others are
+        """
+        for name, (low, high) in RANGES.items():
+            value = getattr(args, name)
+            if value is None or low <= value <= high or (value == -1 and name in WITH_DEFAULT):
+                continue
+            limit = f"at least {low}" if high == math.inf else f"between {low} and {high}"
+            self.error(f"--{name.replace('_', '-')} must be {limit}, got {value}")
+        if args.track and importlib.util.find_spec("wandb") is None:
+            raise UserError("--track needs Weights & Biases: pip install wandb")
+        if args.device.startswith("cuda") and not th.cuda.is_available():
+            raise UserError(f"--device {args.device}: PyTorch finds no CUDA device here; pass --device cpu")
+        if not args.log_folder:
+            self.error("-f needs the name of a folder")
 
     def _resumed(self, run: Path) -> argparse.Namespace:
         """The arguments that a run was started with, changed by those given now."""
@@ -128,6 +167,9 @@ class Parser(argparse.ArgumentParser):
         self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
         args = super().parse_args()
         args.resume = str(run)
+        if args.optimize_hyperparameters:
+            raise UserError("--resume continues a run, and -optimize makes many: give one of them")
+        self._check(args)
         last = run / last_model(saved["env"])
         if last.exists() and latest_checkpoint(run) is None:
             remove_checkpoints(run)  # remains of them, if the run was killed while it removed them

@@ -11,14 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from gymnasium.spaces.utils import flatdim
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import ProgressBarCallback
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por.common import plain
@@ -51,37 +48,15 @@ from sb3_por.runs.folder import (
     read_settings,
     write_settings,
 )
+from sb3_por.common.checks import check_types
 from sb3_por.runs.lock import lock_folder
 from sb3_por.runs.origin import mark_as_own, note_foreign
+from sb3_por.training.checks import check_policy, check_settings
 from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
 from sb3_por.training.full_disk import PatientLogs, keep_playing
 from sb3_por.training.trials import trial_settings
 from sb3_por.training.workers import WorkerProcesses
 from sb3_por.visual.algorithm import VisualAlgorithm
-
-
-def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
-    """
-    :param policy: Policy that the settings name
-    :raises UserError: If the policy cannot read the observations
-    """
-    if policy == "CnnPolicy" and isinstance(space, spaces.Box) and len(space.shape) == 3 and space.low.min() < 0:
-        raise UserError(
-            f"normalize:True would normalize the images of {env_id}, which CnnPolicy scales itself; pass -params "
-            "\"normalize:{'norm_obs':False,'norm_reward':True}\" to normalize rewards alone"
-        )
-    needed = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "CnnPolicy" if is_image_space(space) else "MlpPolicy"
-    # MlpPolicy flattens images, which works, however badly.
-    fits = policy == needed or (policy == "MlpPolicy" and needed == "CnnPolicy")
-    if policy in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy") and not fits:
-        alone = " policy_kwargs:{}" if needed == "MlpPolicy" else ""  # the settings may have those of convolutions
-        raise UserError(f"{policy} cannot read the observations of {env_id}, {space}; pass -params policy:{needed}{alone}")
-    if policy != needed and policy == "MlpPolicy":
-        print(
-            f"note: MlpPolicy flattens the images of {env_id} into {flatdim(space)} numbers; you may want "
-            "-params policy:CnnPolicy, or --env-kwargs obs_type:state where the environment has it",
-            file=sys.stderr,
-        )
 
 
 class Experiment(ExperimentManager):
@@ -124,6 +99,7 @@ class Experiment(ExperimentManager):
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         if "normalize" in saved:
             hyperparams["normalize"] = saved["normalize"] = read_normalization(saved["normalize"])
+            check_types(VecNormalize, saved["normalize"] if isinstance(saved["normalize"], dict) else {})
         held_out = evaluation_kwargs(self.env_name.gym_id)
         self.eval_env_kwargs = {**whole_episodes(self.env_kwargs), **held_out, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved
@@ -196,8 +172,23 @@ class Experiment(ExperimentManager):
         """Leave it to ``create_envs``; the zoo normalizes inside of the frame stack."""
         return env
 
+    def hyperparameters_optimization(self) -> None:
+        """Report in one line why a search has failed, and leave no run's folder behind."""
+        try:
+            super().hyperparameters_optimization()
+        except Exception as error:  # of any database's driver, sampler or trial
+            if self.verbose > 1:
+                raise
+            raise UserError(f"the search of {self.algo} has failed: {one_line(error)} (--verbose 2 shows where)") from error
+        finally:
+            if self._folder_made:
+                shutil.rmtree(self.save_path, ignore_errors=True)
+
     def create_callbacks(self) -> None:
         """Our evaluation and checkpoints, counted in environment steps."""
+        for callback in self.callbacks:
+            if not isinstance(callback, BaseCallback):
+                raise UserError(f"the setting callback names {type(callback).__name__}, which is no callback of SB3")
         if self.show_progress:
             self.callbacks.append(ProgressBarCallback())
         self.callbacks.append(PatientLogs())
@@ -247,9 +238,11 @@ class Experiment(ExperimentManager):
         return model
 
     def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> dict[str, Any]:
-        """Check that the policy fits the observations; the zoo builds the model next."""
+        """Check the settings; the zoo builds the model next."""
         check_policy(hyperparams.get("policy"), env.observation_space, self.env_name.gym_id)
-        return super()._preprocess_action_noise(hyperparams, saved, env)
+        arguments: dict[str, Any] = super()._preprocess_action_noise(hyperparams, saved, env)
+        check_settings(self.algo, arguments)
+        return arguments
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         """Plain YAML; the zoo writes Python objects, which only an unsafe loader reads."""

@@ -35,7 +35,7 @@ MAX = sys.float_info.max
 #: Smallest and largest value of each numeric argument
 RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("tau", "encoder_tau", "gamma"), (0, 1)),
-    **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "train_freq"), (1, MAX)),
+    **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "train_freq", "stats_window_size"), (1, MAX)),
     **dict.fromkeys(("actor_update_interval", "target_update_interval", "diagnostics_interval"), (1, MAX)),
     **dict.fromkeys(("n_augmentations", "n_target_augmentations"), (1, MAX)),
     **dict.fromkeys(("learning_rate", "learning_starts", "augmentation_pad", "por_coef"), (0, MAX)),

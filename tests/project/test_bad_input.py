@@ -71,14 +71,17 @@ def test_models_and_environments_that_do_not_exist(tmp_path, monkeypatch, model,
 
 @EXAMPLES
 @given(
+    st.sampled_from(["sac_por", "sac"]),
     st.sampled_from(["por_coef", "gamma", "tau", "learning_rate", "batch_size", "k", "pairing", "random_k", "buffer_size"]),
     st.sampled_from(["x", "'fast'", "-1", "[1]", "{}", "None", "1e400", "nan", "()", "print"]),
 )
-def test_settings_of_training(tmp_path, monkeypatch, name, value):
+def test_settings_of_training(tmp_path, monkeypatch, algo, name, value):
+    """Of our algorithms and of SB3's, which has some of the names."""
     allowed = {("random_k", "None"), ("learning_rate", "print")}
     monkeypatch.chdir(tmp_path)
     logs = tmp_path / uuid.uuid4().hex
-    words = ["--algo", "sac_por", "--env", "FallingBall-v0", "-n", "1", "-f", str(logs), "--env-kwargs", "image_size:36"]
+    of_task = {"sac_por": ["FallingBall-v0", "--env-kwargs", "image_size:36"], "sac": ["Pendulum-v1"]}[algo]
+    words = ["--algo", algo, "-n", "1", "-f", str(logs), "--env", *of_task]
     monkeypatch.setattr("sys.argv", ["train.py"])
     code, lines = outcome(train, [*words, "-params", f"{name}:{value}"])
     if (name, value) not in allowed:

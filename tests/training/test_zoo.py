@@ -25,7 +25,8 @@ from sb3_por.common.errors import UserError
 from sb3_por.evaluation.loading import load_model
 from sb3_por.runs.facts import run_identity
 from sb3_por.training.arguments import Settings, hyperparameter_file
-from sb3_por.training.experiment import Experiment, check_policy
+from sb3_por.training.checks import check_policy
+from sb3_por.training.experiment import Experiment
 from sb3_por.training.zoo import main
 from softbody_envs import ENV_IDS
 
@@ -160,14 +161,40 @@ def test_runs_started_together_get_folders_of_their_own(tmp_path, monkeypatch):
         (["--nonsense"], "unrecognized arguments: --nonsense"),
         (["--algo", "sac", "--env", "CartPole-v1"], "action spaces but Discrete(2) was provided"),
         (["--algo", "sac", "-params", "policy:CnnPolicy"], "pass -params policy:MlpPolicy"),
-        (["--algo", "sac", "-params", "colour:blue"], "unexpected keyword argument 'colour'"),
+        (["--algo", "sac", "-params", "colour:blue"], "unknown setting of sac 'colour'; no name is near it"),
         (["--algo", "sac", "-params", "learning_rate"], "-params takes key:value pairs, got 'learning_rate'"),
         (["--algo", "sac", "--env-kwargs", "obs_type:sound"], "obs_type must be one of pixels, state, dict, got 'sound'"),
         (["--algo", "sac", "-conf", "missing.yml"], "cannot read missing.yml"),
         (["--algo", "sac", "-i", "missing.zip"], "there is no model missing.zip"),
         (["--algo", "sac", "-i", __file__], "corrupt or no .zip at all"),
         (["--gym-packages", "no_such_package"], "No module named 'no_such_package'"),
+        (["--gym-packages", ""], "cannot import the package : Empty module name"),
         (["-f", "/proc/logs"], "cannot write in /proc/logs"),
+        (["-f", ""], "-f needs the name of a folder"),
+        (["-tb", "/proc/tb"], "cannot write in /proc/tb"),
+        (["-n", "0"], "--n-timesteps must be at least 1, got 0"),
+        (["--eval-episodes", "0"], "--eval-episodes must be at least 1, got 0"),
+        (["--n-eval-envs", "-1"], "--n-eval-envs must be at least 1, got -1"),
+        (["--seed", str(2**32)], "--seed must be between 0 and 4294967295"),
+        (["--num-threads", "-2"], "--num-threads must be at least 1, got -2"),
+        (["-optimize", "--n-trials", "0"], "--n-trials must be at least 1, got 0"),
+        (["-optimize", "--n-trials", "1", "--storage", "/proc/study.log"], "No such file or directory: '/proc/study.log'"),
+        (
+            ["--algo", "sac", "-params", "learning_start:5"],
+            "unknown setting of sac 'learning_start'; did you mean learning_starts?",
+        ),
+        (["--algo", "sac", "-params", "batch_size:fast"], "batch_size must be int, got 'fast'"),
+        (["--algo", "sac", "-params", "gamma:-1"], "gamma must be between 0 and 1, got -1"),
+        (["--algo", "sac", "-params", "train_freq:(0,'episode')"], "train_freq must be a finite number of at least 1, got 0"),
+        (["--algo", "sac", "-params", "action_noise:normal"], "noise.ActionNoise | None, got 'normal'"),
+        (["--algo", "sac", "-params", "normalize:{'gamma':'x'}"], "gamma must be float, got 'x'"),
+        (["--algo", "sac", "-params", "normalize:open('x')"], "-params normalize:open('x'): FileNotFoundError"),
+        (["--algo", "sac", "-params", "normalize:often"], "normalize must be True, False or arguments of VecNormalize"),
+        (["--algo", "sac", "-params", "gamma:1/0"], "-params gamma:1/0: ZeroDivisionError: division by zero"),
+        (["--algo", "sac", "-params", "gamma:exit()"], "-params gamma:exit(): SystemExit"),
+        (["--algo", "sac", "-params", "callback:builtins.dict"], "callback names dict, which is no callback"),
+        (["--algo", "sac", "-params", "env_wrapper:no_such.Wrapper"], "No module named 'no_such'"),
+        (["--algo", "sac", "-params", "policy_kwargs:'dict('"], "was never closed"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_no_run(flags, message, tmp_path, capsys):
@@ -177,6 +204,26 @@ def test_bad_input_is_one_line_and_leaves_no_run(flags, message, tmp_path, capsy
     assert len(said) == 1 and said == lines[-1:] and message in said[0]
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
     assert not list(tmp_path.glob("*/*_*"))
+
+
+def test_a_gpu_that_is_not_there_is_said(capsys, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert main([*PENDULUM, "--device", "cuda"]) == 2
+    assert "--device cuda: PyTorch finds no CUDA device here" in capsys.readouterr().err
+
+
+def test_more_evaluation_environments_than_episodes_play_these(tmp_path):
+    flags = ["-n", "10", "--eval-freq", "5", "--n-eval-envs", "3", "-f", str(tmp_path)]
+    assert main([*PENDULUM, *flags, *SMALL]) == 0
+    with np.load(tmp_path / "sac" / "Pendulum-v1_1" / "evaluations.npz") as file:
+        assert file["results"].shape == (2, 2)
+
+
+def test_a_search_leaves_its_report_and_no_run(tmp_path, capsys):
+    flags = ["-optimize", "--n-trials", "1", "--no-optim-plots", "--n-evaluations", "1", "-n", "60", "-f", str(tmp_path)]
+    assert main([*PENDULUM, *flags, *SMALL]) == 0
+    assert {path.suffix for path in (tmp_path / "sac").iterdir()} == {".csv", ".pkl"}
+    assert main(["--resume", str(tmp_path), "-optimize"]) == 2
 
 
 def test_training_that_diverges_is_one_line_and_keeps_the_checkpoints(tmp_path, capsys):

@@ -1,0 +1,54 @@
+"""Checks of a run's settings before it is made."""
+
+import inspect
+import sys
+from typing import Any
+
+from gymnasium import spaces
+from gymnasium.spaces.utils import flatdim
+from rl_zoo3 import ALGOS
+from stable_baselines3.common.preprocessing import is_image_space
+
+from sb3_por.common.checks import check_ranges, check_types
+from sb3_por.common.errors import UserError, check_known
+from sb3_por.visual.algorithm import RANGES
+
+
+def check_settings(algo: str, settings: dict[str, Any]) -> None:
+    """
+    Check the arguments of an algorithm, SB3's own ones, too: SB3 fails at the first update, or computes with what it got.
+
+    :param algo: Name of the algorithm
+    :param settings: Arguments of its constructor
+    :raises UserError: If it has no such argument; the message has the nearest one
+    :raises TypeError: If a value has the wrong type
+    :raises ValueError: If a number is out of its range
+    """
+    for name in settings:
+        check_known(f"setting of {algo}", name, inspect.signature(ALGOS[algo]).parameters)
+    check_types(ALGOS[algo], settings)
+    check_ranges(settings, RANGES)
+
+
+def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:
+    """
+    :param policy: Policy that the settings name
+    :raises UserError: If the policy cannot read the observations
+    """
+    if policy == "CnnPolicy" and isinstance(space, spaces.Box) and len(space.shape) == 3 and space.low.min() < 0:
+        raise UserError(
+            f"normalize:True would normalize the images of {env_id}, which CnnPolicy scales itself; pass -params "
+            "\"normalize:{'norm_obs':False,'norm_reward':True}\" to normalize rewards alone"
+        )
+    needed = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "CnnPolicy" if is_image_space(space) else "MlpPolicy"
+    # MlpPolicy flattens images, which works, however badly.
+    fits = policy == needed or (policy == "MlpPolicy" and needed == "CnnPolicy")
+    if policy in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy") and not fits:
+        alone = " policy_kwargs:{}" if needed == "MlpPolicy" else ""  # the settings may have those of convolutions
+        raise UserError(f"{policy} cannot read the observations of {env_id}, {space}; pass -params policy:{needed}{alone}")
+    if policy != needed and policy == "MlpPolicy":
+        print(
+            f"note: MlpPolicy flattens the images of {env_id} into {flatdim(space)} numbers; you may want "
+            "-params policy:CnnPolicy, or --env-kwargs obs_type:state where the environment has it",
+            file=sys.stderr,
+        )

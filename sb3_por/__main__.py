@@ -64,8 +64,8 @@ def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     from sb3_por.evaluation.loading import find_environment, resolve
     from sb3_por.evaluation.reference_policies import REFERENCES
 
-    if args.seed < 0:
-        raise UserError(f"--seed must not be negative, got {args.seed}")
+    if not 0 <= args.seed < 2**32:
+        raise UserError(f"--seed must be from 0 to {2**32 - 1}, got {args.seed}")
     is_reference = args.model in REFERENCES
     args.env = find_environment(args.env, None if is_reference or args.pretrained else args.model, args.safe)
     if args.pretrained:

@@ -14,6 +14,8 @@ from softbody_envs.variations import SPLITS, check_variation, variation_rng
 from softbody_envs.window import Window
 
 OBS_TYPES = ("pixels", "state", "dict")
+#: Largest height and width of images, pixels. Bullet ends the process when it has no memory for one.
+MAX_SIZE = 4096
 #: Bound of every element of a state vector, in the units of the task's page. Values are clipped to it.
 STATE_LIMIT = 10.0
 #: Tolerance of the success test: a rounding error must not decide it.
@@ -74,8 +76,8 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
         for name, size in (("image_size", image_size), ("render_size", render_size)):
-            if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
-                raise ValueError(f"{name} must be a positive number of pixels, got {size!r}")
+            if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not 1 <= size <= MAX_SIZE:
+                raise ValueError(f"{name} must be a number of pixels from 1 to {MAX_SIZE}, got {size!r}")
         self.obs_type = obs_type
         self.image_size = image_size
         self.split = split

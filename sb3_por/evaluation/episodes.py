@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.common.errors import UserError
@@ -129,7 +130,17 @@ class FixedEpisodes(gym.Wrapper):
         if not np.isfinite(action).all():
             raise UserError(f"the model's action is {action}, not finite; use an earlier checkpoint")
         observation, reward, terminated, truncated, info = self.env.step(action)
+        if (terminated or truncated) and "episode" not in info:
+            info = info | {"episode": self._so_far()}
         return observation, reward, terminated, truncated, info | {"evaluation_episode": self._current.index}
+
+    def _so_far(self) -> dict[str, Any]:
+        """What ``Monitor`` has seen of an episode that a wrapper around it has ended; it counts its own ends alone."""
+        env = self.env
+        while isinstance(env, gym.Wrapper) and not isinstance(env, Monitor):
+            env = env.env
+        rewards = env.rewards if isinstance(env, Monitor) else []
+        return {"r": float(sum(rewards)), "l": len(rewards)}
 
 
 def evaluation_episodes(env_id: str, n_episodes: int, seed: int = EVAL_SEED) -> list[Episode]:

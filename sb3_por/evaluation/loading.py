@@ -187,7 +187,8 @@ def _arguments(
         arguments["env_kwargs"] = whole_episodes(import_names(made_of.env_kwargs or {}))
         arguments["env_wrapper"] = import_wrappers(made_of.env_wrapper)
         arguments["vec_env_wrapper"] = import_wrappers(made_of.vec_env_wrapper)
-    elif made_of.env_wrapper or made_of.vec_env_wrapper:
+        missing = missing or bool(made_of.unknown)
+    elif made_of.env_wrapper or made_of.vec_env_wrapper or made_of.unknown:
         missing = True
     if missing and not quiet:
         warnings.warn(f"{env_id} is made without what the model was trained in: {made_of}", UserNote)

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.runs.folder import dump_settings, import_names, parse_settings
+from sb3_por.visual.made_of import made_of
 
 #: A function that wraps an environment
 EnvWrapper = Callable[[gym.Env], gym.Env]
@@ -32,6 +33,7 @@ class TrainingEnvironment:
     :param vec_env_wrapper: Wrappers of the vectorized environments, in the same form
     :param frame_stack: Number of stacked frames
     :param normalize: Whether ``VecNormalize`` was used, or its arguments
+    :param unknown: Names of wrappers and arguments that cannot be made again
     """
 
     env_id: str
@@ -40,6 +42,7 @@ class TrainingEnvironment:
     vec_env_wrapper: Any = None
     frame_stack: int | None = None
     normalize: Any = None
+    unknown: list[str] | None = None
 
     @classmethod
     def of_settings(cls, env_id: str, settings: dict[str, Any]) -> "TrainingEnvironment":
@@ -57,9 +60,13 @@ class TrainingEnvironment:
     def of_model(cls, model: Any) -> "TrainingEnvironment | None":
         """
         :param model: An SB3 model
-        :return: What ``train.py`` stored in it; None for a model that was trained otherwise
+        :return: What ``train.py`` or ``learn()`` stored in it, or what its environments tell; None if that is unknown
         """
-        return cls.of_data(vars(model)) if hasattr(model, "__dict__") else None
+        if not hasattr(model, "__dict__"):
+            return None
+        stored = cls.of_data(vars(model))
+        described = made_of(vars(model).get("env")) if stored is None else None
+        return stored if described is None else cls(**described)
 
     @classmethod
     def of_data(cls, data: dict[str, Any]) -> "TrainingEnvironment | None":
@@ -67,9 +74,11 @@ class TrainingEnvironment:
         :param data: Attributes of an SB3 model
         :return: As :meth:`of_model`; None if the text cannot be read, too
         """
-        text = data.get(ATTRIBUTE)
+        text, described = data.get(ATTRIBUTE), data.get("environment_made_of")
         try:
-            return cls(**parse_settings(text)) if isinstance(text, str) else None
+            if isinstance(text, str):
+                return cls(**parse_settings(text))
+            return cls(**described) if isinstance(described, dict) else None
         except (TypeError, ValueError):
             return None
 
@@ -81,7 +90,12 @@ class TrainingEnvironment:
 
     def __str__(self) -> str:
         """Wrappers and normalization, for messages."""
-        named = {"env_wrapper": self.env_wrapper, "vec_env_wrapper": self.vec_env_wrapper, "normalize": self.normalize}
+        named = {
+            "env_wrapper": self.env_wrapper,
+            "vec_env_wrapper": self.vec_env_wrapper,
+            "normalize": self.normalize,
+            "unknown": self.unknown,
+        }
         return f"{self.env_id} with " + ", ".join(f"{name} {value}" for name, value in named.items() if value)
 
     def store_in(self, model: Any) -> None:

@@ -28,6 +28,7 @@ from sb3_por.demonstrations.dataset import Demonstrations, describe
 from sb3_por.demonstrations.playback import fill, n_transitions
 from sb3_por.objectives.base import Objective
 from sb3_por.visual.batch import Augmentation
+from sb3_por.visual.made_of import made_of
 from sb3_por.visual.normalization import transpose_inside
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 
@@ -77,6 +78,9 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
     bc_coef: float
     precision: str
     compile_mode: str | None
+
+    #: Saved, so that a model alone can be evaluated in the same; see ``made_of``
+    environment_made_of: dict[str, Any] | None = None
 
     # What SAC and TQC have in common
     policy: Any
@@ -190,6 +194,7 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         :param progress_bar: Show a progress bar
         :return: The model
         """
+        self.environment_made_of = made_of(self.env)
         name = type(self).__name__ if tb_log_name is None else tb_log_name
         if self.demos is not None and self.demo_buffer is None:
             self.load_demos(self.demos)

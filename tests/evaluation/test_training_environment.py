@@ -2,22 +2,26 @@
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from gymnasium.envs.classic_control import PendulumEnv
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecFrameStack
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
+from sb3_por import SACPOR
 from sb3_por.common.errors import UserError, UserNote
 from sb3_por.evaluation import evaluate
 from sb3_por.evaluation.loading import resolve
 from sb3_por.runs.environment import TrainingEnvironment, import_wrappers
 from sb3_por.runs.folder import dump_settings, import_names, parse_settings
 from sb3_por.training.zoo import main
+from sb3_por.visual.made_of import made_of
 from softbody_envs.registration import task_class
 from softbody_envs.tasks.falling_ball import FallingBallEnv
 from softbody_envs.wrappers import ActionRepeat
@@ -174,3 +178,89 @@ def test_a_users_own_task_is_scored_on_held_out_scenes():
     finally:
         gym.registry.pop("OwnBall-v0")
         gym.registry.pop("SmallBall-v0")
+
+
+class Unrecorded(gym.ActionWrapper):
+    """A wrapper that does not tell its arguments."""
+
+    def __init__(self, env, factor):
+        super().__init__(env)
+        self.factor = factor
+
+    def action(self, action):
+        return self.factor * action
+
+
+def scores(model, **given):
+    """Returns in two episodes; fails if there is a note."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserNote)
+        return evaluate(model, "Pendulum-v1", n_episodes=2, **given).returns
+
+
+@pytest.mark.parametrize("cls", [SACPOR, SAC])
+def test_a_model_trained_from_python_is_evaluated_inside_its_wrappers(cls, tmp_path):
+    env = gym.make("Pendulum-v1", g=1.0, max_episode_steps=7, render_mode="rgb_array")
+    env = gym.wrappers.RecordEpisodeStatistics(gym.wrappers.TimeLimit(ActionRepeat(env, 5, 0.5), 6))
+    model = cls("MlpPolicy", env, buffer_size=100, learning_starts=1000, seed=0).learn(10)
+    same = {"env_kwargs": {"g": 1.0}, "env_wrapper": lambda inner: ActionRepeat(inner, 5, 0.5)}
+    assert scores(model) == scores(model, **same) and len(scores(model)) == 2
+    assert scores(model) != scores(model, env_wrapper=lambda inner: inner)
+    assert scores(model) != scores(model, env_kwargs={"g": 10.0})
+    if cls is SACPOR:  # SB3's own classes do not save it
+        model.save(tmp_path / "model.zip")
+        assert scores(tmp_path / "model.zip") == scores(SACPOR.load(tmp_path / "model.zip")) == scores(model)
+        env = gym.make("Pendulum-v1")
+        SACPOR.load(tmp_path / "model.zip", env=env).save(tmp_path / "again.zip")  # has not learned there
+        assert scores(tmp_path / "again.zip") == scores(model)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "name"),
+    [
+        (lambda env: Unrecorded(env, 0.5), "Unrecorded"),
+        (lambda env: gym.wrappers.TransformAction(env, lambda action: action, env.action_space), "TransformAction"),
+    ],
+)
+def test_a_wrapper_that_cannot_be_made_again_is_noted(wrap, name, tmp_path):
+    env = ActionRepeat(wrap(gym.make("Pendulum-v1")), 2)
+    model = SACPOR("MlpPolicy", env, buffer_size=100, learning_starts=1000).learn(5)
+    model.save(tmp_path / "model.zip")
+    for given in (model, tmp_path / "model.zip"):
+        with pytest.warns(UserNote, match=f"made without what the model was trained in: .*unknown .*{name}"):
+            evaluate(given, "Pendulum-v1", n_episodes=1)
+    scores(model, env_wrapper=lambda inner: ActionRepeat(wrap(inner), 2))
+
+
+def test_the_statistics_of_a_model_trained_from_python_are_asked_for(tmp_path):
+    env = VecNormalize(make_vec_env("Pendulum-v1"))
+    model = SACPOR("MlpPolicy", env, buffer_size=100, learning_starts=1000).learn(5)
+    model.save(tmp_path / "model.zip")
+    env.save(str(tmp_path / "statistics.pkl"))
+    with pytest.warns(UserNote, match="Pendulum-v1 with normalize {'norm_obs': True"):
+        evaluate(tmp_path / "model.zip", "Pendulum-v1", n_episodes=1)
+    scores(model, vec_normalize=str(tmp_path / "statistics.pkl"))
+
+
+def test_an_episode_that_a_wrapper_ends_is_scored(tmp_path):
+    """``Monitor`` is inside of the wrappers, and does not count it."""
+    limit = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 3}}
+    settings = [f"env_wrapper:{[REPEAT, limit]}", "learning_starts:10", "batch_size:8", "policy:MlpPolicy"]
+    flags = ["--algo", "sac", "--env", "Pendulum-v1", "-n", "12", "--eval-freq", "12", "--eval-episodes", "2", "--seed", "1"]
+    assert main([*flags, "-f", str(tmp_path), "-params", *settings]) == 0
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    evaluation = evaluate(run, "Pendulum-v1", n_episodes=2)
+    assert evaluation.lengths == [15, 15]
+    with np.load(run / "evaluations.npz") as file:
+        assert file["ep_lengths"].tolist() == [[15, 15]]
+        assert file["results"][0] == pytest.approx(evaluation.returns)
+
+
+def test_what_a_factory_wraps_is_not_wrapped_twice():
+    gym.register("Factory-v0", lambda **kwargs: ActionRepeat(PendulumEnv(**kwargs), 2), max_episode_steps=30)
+    try:
+        model = SACPOR("MlpPolicy", gym.make("Factory-v0", g=1.0), buffer_size=100, learning_starts=1000).learn(5)
+        assert made_of(model.env)["env_wrapper"] == []
+        assert evaluate(model, "Factory-v0", n_episodes=1).lengths == [30]
+    finally:
+        gym.registry.pop("Factory-v0")

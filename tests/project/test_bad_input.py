@@ -139,7 +139,9 @@ def test_damaged_models(model, tmp_path, data):
 @EXAMPLES
 @given(
     st.sampled_from(["obs_type", "image_size", "split", "renderer", "render_mode", "render_size"]),
-    st.one_of(st.text(max_size=5), st.integers(max_value=0), st.floats(), st.none(), st.just([1])),
+    st.one_of(
+        st.text(max_size=5), st.integers(max_value=0), st.integers(min_value=4097), st.floats(), st.none(), st.just([1])
+    ),
 )
 def test_constructor_arguments(name, value):
     # Hypothesis also draws words of the source, which may be right

@@ -131,7 +131,7 @@ def test_plot_draws_every_figure_into_a_folder(run, tmp_path, capsys):
         (["evaluate", "--model", "expert", "--env", "FallingBall-v0"], "environment with an expert 'FallingBall-v0'"),
         (["evaluate", "--model", "nothing", "--env", "CartPole-v1"], "has no action that does nothing"),
         (["evaluate", "--model", "RUN", "--env", "no_such_package:E-v0"], "cannot import the package no_such_package"),
-        (["evaluate", "--model", "RUN", "--env", "Pendulum-v1", "--seed", "-5"], "--seed must not be negative"),
+        (["evaluate", "--model", "RUN", "--env", "Pendulum-v1", "--seed", "-5"], "--seed must be from 0 to 4294967295"),
         (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "video.gif", "--size", "0"], "at least 1 pixel"),
         (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "video.avi"], "must end in .gif or .mp4"),
         (["enjoy", "--model", "RUN", "--env", "Pendulum-v1", "-o", "/proc/video.gif"], "cannot write in /proc"),

@@ -1,0 +1,74 @@
+"""What a model's environments are made of, as far as they tell, to evaluate the model in the same."""
+
+import json
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import OrderEnforcing
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+
+#: Wrappers that change neither what a policy sees nor how its actions act, and subclasses; whole episodes are scored
+PASSED_OVER = (
+    "HumanRendering",
+    "Monitor",
+    "RecordEpisodeStatistics",
+    "RecordVideo",
+    "RenderCollection",
+    "TimeLimit",
+)
+#: Arguments of an environment that evaluation chooses itself
+CHOSEN = ("render_mode", "render_size", "split")
+
+
+def made_of(env: VecEnv | None) -> dict[str, Any] | None:
+    """
+    Describe environments that ``gymnasium.make`` has made, and the wrappers around them.
+
+    :param env: Vectorized environments of this process; worker processes keep theirs
+    :return: For JSON: ``env_id``, ``env_kwargs``, ``env_wrapper`` (``[{path: arguments}]``, the innermost first),
+        ``normalize`` (arguments of ``VecNormalize``) and ``unknown`` (names of what cannot be made again from its name and
+        plain arguments); None where nothing is known
+    """
+    normalize = None
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecNormalize):
+            normalize = {"norm_obs": env.norm_obs, "norm_reward": env.norm_reward}
+        env = env.venv
+    inner = next(iter(getattr(env, "envs", [])), None)
+    wrappers: list[gym.Wrapper] = []
+    # What gymnasium.make has put inside of OrderEnforcing, it makes again
+    while isinstance(inner, gym.Wrapper) and not isinstance(inner, OrderEnforcing):
+        if not any(cls.__name__ in PASSED_OVER for cls in type(inner).__mro__):
+            wrappers.insert(0, inner)
+        inner = inner.env
+    if inner is None or inner.spec is None:
+        return None
+    known = [wrapper for wrapper in wrappers if _can_be_made(wrapper)]
+    kwargs = {name: value for name, value in inner.spec.kwargs.items() if name not in CHOSEN}
+    return {
+        "env_id": inner.spec.id,
+        "env_kwargs": {name: value for name, value in kwargs.items() if _is_plain(value)},
+        "env_wrapper": [{f"{type(one).__module__}:{type(one).__qualname__}": _arguments(one)} for one in known],
+        "normalize": normalize,
+        "unknown": [type(wrapper).__name__ for wrapper in wrappers if wrapper not in known]
+        + [name for name, value in kwargs.items() if not _is_plain(value)],
+    }
+
+
+def _can_be_made(wrapper: gym.Wrapper) -> bool:
+    return (
+        isinstance(wrapper, RecordConstructorArgs) and "<" not in type(wrapper).__qualname__ and _is_plain(_arguments(wrapper))
+    )
+
+
+def _arguments(wrapper: Any) -> dict[str, Any]:
+    return {name: value for name, value in wrapper._saved_kwargs.items() if name != "env"}
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether JSON keeps a value as it is."""
+    try:
+        return bool(json.loads(json.dumps(value)) == value)
+    except (TypeError, ValueError):
+        return False

@@ -34,6 +34,13 @@ class Command:
     run: Callable[[argparse.Namespace], object]
 
 
+def _seed(text: str) -> int:
+    """A seed as numpy takes it."""
+    if not text.isdecimal() or int(text) >= 2**32:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to {2**32 - 1}, got {text!r}")
+    return int(text)
+
+
 def _model_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
     which = parser.add_mutually_exclusive_group(required=required)
     models = "a .zip, a run folder (its best model), random, nothing, or expert"
@@ -54,7 +61,7 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     _model_arguments(parser)
     episodes = "held-out episodes (default 20; with --pretrained those of the published scores)"
     parser.add_argument("-n", "--n-episodes", type=int, help=episodes)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--json", action="store_true", help="print every episode as JSON")
 
 
@@ -64,8 +71,6 @@ def _load(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     from sb3_por.evaluation.loading import find_environment, resolve
     from sb3_por.evaluation.reference_policies import REFERENCES
 
-    if not 0 <= args.seed < 2**32:
-        raise UserError(f"--seed must be from 0 to {2**32 - 1}, got {args.seed}")
     is_reference = args.model in REFERENCES
     args.env = find_environment(args.env, None if is_reference or args.pretrained else args.model, args.safe)
     if args.pretrained:
@@ -109,7 +114,7 @@ def _enjoy_arguments(parser: argparse.ArgumentParser) -> None:
     where.add_argument("-o", "--output", help="the video: .gif or .mp4")
     where.add_argument("--human", action="store_true", help="show the episodes in a window instead; pip install '.[human]'")
     parser.add_argument("-n", "--n-episodes", type=int, default=1, help="held-out episodes (default 1)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--size", type=int, default=480, help="height and width in pixels (default 480)")
 
 
@@ -144,7 +149,7 @@ def _record_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-kwargs", nargs="+", default={}, action=Settings, metavar="KEY:VALUE", help=kwargs)
     parser.add_argument("-o", "--output", required=True, help="folder of the new dataset, in Minari's format")
     parser.add_argument("-n", "--n-episodes", type=int, default=50, help="episodes of training scenes (default 50)")
-    parser.add_argument("--seed", type=int, default=0, help="chooses the scenes (default 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="chooses the scenes (default 0)")
 
 
 def _record(args: argparse.Namespace) -> None:
@@ -152,8 +157,6 @@ def _record(args: argparse.Namespace) -> None:
     from sb3_por.evaluation.loading import find_environment
     from sb3_por.training.record import EXPERT, record, settings_environment
 
-    if args.seed < 0:
-        raise UserError(f"--seed must not be negative, got {args.seed}")
     env_id = find_environment(args.env, None if args.model == EXPERT else args.model, args.safe)
     algo = args.algo or ("sac_por" if args.model == EXPERT else None)
     if algo is None and (args.conf_file or args.hyperparams or args.env_kwargs):
@@ -176,7 +179,7 @@ def _plot_arguments(parser: argparse.ArgumentParser) -> None:
     step = "compare at this step, and leave out runs that end before (default: the end of the shortest run)"
     parser.add_argument("--step", type=int, help=step)
     parser.add_argument("--csv", help="write the table of scores here, too")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the bootstrap (default 0)")
 
 
 def _plot(args: argparse.Namespace) -> None:
@@ -228,7 +231,7 @@ def _diagnose_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", "--n-episodes", type=int, default=5, help="held-out episodes of each policy (default 5)")
     fresh = "also train fresh heads on the frozen encoder, on an untrained one, and with sham labels, as controls"
     parser.add_argument("--fresh-head", action="store_true", help=fresh)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the first episode (default 0)")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
@@ -261,7 +264,7 @@ def _saliency_arguments(parser: argparse.ArgumentParser) -> None:
     _model_arguments(parser)
     parser.add_argument("-o", "--output", required=True, help="the picture: .png or .jpg")
     parser.add_argument("--step", type=int, help="number of the frame (default: where the monotone quantity rises most)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the episode (default 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the episode (default 0)")
 
 
 def _saliency(args: argparse.Namespace) -> None:
@@ -301,7 +304,7 @@ def _report_arguments(parser: argparse.ArgumentParser) -> None:
     step = "compare at this step, and leave out runs that end before (default: the end of the shortest run)"
     parser.add_argument("--step", type=int, help=step)
     parser.add_argument("--no-videos", action="store_true", help="leave out videos and saliency maps: much quicker")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the bootstrap (default 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the bootstrap (default 0)")
 
 
 def _report(args: argparse.Namespace) -> None:

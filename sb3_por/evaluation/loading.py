@@ -1,7 +1,6 @@
 """Loading of any saved model for use: with its algorithm and its environment, without its replay buffer."""
 
 import importlib
-import pickle
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -66,13 +65,24 @@ def load_model(path: str | Path, algo: str | None = None, device: str = "auto") 
     for name in names:
         try:
             with quiet_n_steps():
-                return LOADABLE[name].load(path, device=device, **buffer)
-        # SB3 loads strictly: the wrong class fails on the names of the networks' parameters.
-        except (AssertionError, AttributeError, KeyError, RuntimeError, TypeError, ValueError, pickle.PickleError) as error:
+                model = LOADABLE[name].load(path, device=device, **buffer)
+            _check_policy(model)
+            return model
+        # SB3 loads strictly: the wrong class fails on the names of the networks' parameters. A damaged file can raise anything
+        except Exception as error:
             problem = problem or error
     if problem is None:
         raise UserError(f"cannot tell which algorithm saved {path}; say --algo, one of {', '.join(LOADABLE)}")
     raise UserError(f"{path} is not a model of {' or '.join(names)}: {one_line(problem)[:200]}") from problem
+
+
+def _check_policy(model: BaseAlgorithm) -> None:
+    """
+    :raises TypeError: If the policy is one of another algorithm: TQC loads a model of SAC
+    """
+    own = tuple(model.policy_aliases.values())
+    if own and not isinstance(model.policy, own):
+        raise TypeError(f"{type(model).__name__} has no {type(model.policy).__name__}")
 
 
 def resolve(

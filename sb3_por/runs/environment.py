@@ -44,6 +44,10 @@ class TrainingEnvironment:
     normalize: Any = None
     unknown: list[str] | None = None
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.env_kwargs, dict | None):
+            raise UserError(f"env_kwargs must be arguments of an environment by name, got {self.env_kwargs!r}")
+
     @classmethod
     def of_settings(cls, env_id: str, settings: dict[str, Any]) -> "TrainingEnvironment":
         """

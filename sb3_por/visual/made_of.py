@@ -49,7 +49,7 @@ def made_of(env: VecEnv | None) -> dict[str, Any] | None:
     return {
         "env_id": inner.spec.id,
         "env_kwargs": {name: value for name, value in kwargs.items() if _is_plain(value)},
-        "env_wrapper": [{f"{type(one).__module__}:{type(one).__qualname__}": _arguments(one)} for one in known],
+        "env_wrapper": [{_path(type(one)): _arguments(one)} for one in known],
         "normalize": normalize,
         "unknown": [type(wrapper).__name__ for wrapper in wrappers if wrapper not in known]
         + [name for name, value in kwargs.items() if not _is_plain(value)],
@@ -60,6 +60,12 @@ def _can_be_made(wrapper: gym.Wrapper) -> bool:
     return (
         isinstance(wrapper, RecordConstructorArgs) and "<" not in type(wrapper).__qualname__ and _is_plain(_arguments(wrapper))
     )
+
+
+def _path(cls: type) -> str:
+    """Dotted path as users type it: ``gymnasium.wrappers.ClipReward``."""
+    is_public = getattr(gym.wrappers, cls.__name__, None) is cls
+    return f"gymnasium.wrappers.{cls.__name__}" if is_public else f"{cls.__module__}.{cls.__qualname__}"
 
 
 def _arguments(wrapper: Any) -> dict[str, Any]:

@@ -123,16 +123,19 @@ def model(tmp_path_factory):
 @EXAMPLES
 @given(st.data())
 def test_damaged_models(model, tmp_path, data):
-    """Truncated, or without one of its members."""
+    """Truncated, without one of its members, or with one that is cut."""
     file = tmp_path / "model.zip"
     if data.draw(st.booleans()):
         file.write_bytes(model[: data.draw(st.integers(0, len(model) - 1))])
     else:
         with zipfile.ZipFile(io.BytesIO(model)) as whole, zipfile.ZipFile(file, "w") as part:
-            lost = data.draw(st.sampled_from(["data", "policy.pth"]))
+            members = [name for name in whole.namelist() if name == "data" or name.endswith(".pth")]
+            lost = data.draw(st.sampled_from(["data", "policy.pth", None]))
+            cut = data.draw(st.sampled_from(members)) if lost is None else None
             for name in whole.namelist():
+                content = whole.read(name)
                 if name != lost:
-                    part.writestr(name, whole.read(name))
+                    part.writestr(name, content[: data.draw(st.integers(0, len(content) // 2))] if name == cut else content)
     assert_refused(*outcome(main, ["evaluate", "--model", str(file), "--env", "FallingBall-v0"]))
 
 

@@ -42,6 +42,14 @@ def test_reading_runs_nothing(strangers_module, tmp_path):
     assert (tmp_path / "ran").exists()
 
 
+def test_a_model_whose_text_is_damaged_tells_nothing():
+    for text in ("junk: [", "env_id: E-v0\nfoo: 1", "env_id: E-v0\nenv_kwargs: 3", "- 1", 3):
+        assert TrainingEnvironment.of_data({"training_environment": text}) is None
+    assert TrainingEnvironment.of_data({"environment_made_of": {"foo": 1}}) is None
+    with pytest.raises(UserError, match="env_kwargs must be arguments of an environment by name, got 3"):
+        TrainingEnvironment.of_settings("E-v0", {"env_kwargs": 3})
+
+
 def test_a_class_that_does_not_exist_is_named():
     with pytest.raises(UserError, match=r"cannot import no_such\.Thing"):
         import_names(parse_settings("x: !!python/name:no_such.Thing ''"))

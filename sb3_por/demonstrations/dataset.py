@@ -128,7 +128,7 @@ def write_demonstrations(
     from minari.data_collector.episode_buffer import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
 
-    path = Path(path)
+    path = Path(path).absolute()  # Minari joins a relative one twice
     check_new(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:

@@ -70,6 +70,13 @@ def test_record_from_the_shell(tmp_path, capsys):
     assert "exists; give a new folder" in capsys.readouterr().err
 
 
+def test_a_relative_folder_will_do(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    episode = RecordedEpisode(np.zeros((3, 2)), np.zeros((2, 1)), np.ones(2), terminated=False)
+    write_demonstrations("demos", [episode], gym.spaces.Box(-1, 1, (2,)), gym.spaces.Box(-1, 1, (1,)))
+    assert [len(one.rewards) for one in Demonstrations("demos").episodes()] == [2]
+
+
 def test_a_trained_model_is_recorded_in_its_environment(tmp_path, capsys):
     SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, seed=0).save(tmp_path / "model.zip")
     flags = ["--model", str(tmp_path / "model.zip"), "--env", "Pendulum-v1", "-n", "2", "-o", str(tmp_path / "demos")]

@@ -286,6 +286,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "steady": lambda: courses("steady"),
     "trials": lambda: evaluations("trials"),
     "progress": lambda: evaluations("progress"),
+    "pour": lambda: evaluations("pour"),
     "rope": lambda: evaluations("rope"),
     "fold": lambda: evaluations("fold"),
     "fold_comparison": lambda: comparison("fold"),

@@ -1,6 +1,7 @@
 """Loading of any saved model for use: with its algorithm and its environment, without its replay buffer."""
 
 import importlib
+import reprlib
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -141,7 +142,7 @@ def _load_safe(path: Path, env_id: str, environment: dict[str, Any], algo: str |
     try:
         n_frames = read_settings(path.parent / env_id.rpartition(":")[2] / HYPERPARAMETERS).get("frame_stack") or 1
         if not isinstance(n_frames, int) or not 1 <= n_frames <= MAX_FRAMES:
-            raise UserError(f"frame_stack is refused: {n_frames!r:.80} is no number from 1 to {MAX_FRAMES}")
+            raise UserError(f"frame_stack is refused: {reprlib.repr(n_frames)} is no number from 1 to {MAX_FRAMES}")
         return load_safe(path, VecFrameStack(env, n_frames) if n_frames > 1 else env, algo=algo)
     finally:
         env.close()
@@ -233,6 +234,8 @@ def find_environment(env_id: str, model: str | Path | None = None, safe: bool = 
     if not safe:
         import_packages(packages)
     elif packages and name not in gym.registry:
-        raise UserError(f"safe loading does not import the run's package {packages[0]!r:.80}; --env PACKAGE:{name} does")
+        raise UserError(
+            f"safe loading does not import the packages of the run, {reprlib.repr(packages)}; --env PACKAGE:{name} does"
+        )
     check_known("environment", name, gym.registry)
     return name

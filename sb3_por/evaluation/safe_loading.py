@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import reprlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,6 +49,8 @@ WRAPPERS = (
 )
 #: Attribute of a model whose file holds no Q networks, so that its own are as they were initialized
 LACKS_VALUES = "lacks_values"
+#: Most values among the arguments of an environment
+MAX_VALUES = 10_000
 #: Most parameters of a policy, and most tensors of them: a number in a file cannot fill the memory
 MAX_PARAMETERS, MAX_PARAMETER_TENSORS = 2**26, 10_000
 
@@ -107,7 +110,7 @@ def check_environment(made_of: TrainingEnvironment) -> None:
         for one in spec if isinstance(spec, list) else [spec] if spec else []:
             name, arguments = next(iter(one.items())) if isinstance(one, dict) and len(one) == 1 else (one, {})
             if name not in WRAPPERS:
-                raise UserError(f"the wrapper {name!r:.80} is refused; safe loading knows {', '.join(WRAPPERS)}")
+                raise UserError(f"the wrapper {reprlib.repr(name)} is refused; safe loading knows {', '.join(WRAPPERS)}")
             _check_values(f"arguments of {name}", arguments or {}, texts=False)
     _check_values("env_kwargs", made_of.env_kwargs or {}, texts=task_class(made_of.env_id) is not None)
 
@@ -268,15 +271,19 @@ def _value(name: str, value: Any) -> Any:
 
 def _check_values(what: str, value: Any, texts: bool = True) -> None:
     """
-    :raises UserError: If a stranger's arguments are not plain values
+    :raises UserError: If a stranger's arguments are not plain values, or too many: in YAML, few lines can be a great many
     """
-    if isinstance(value, dict):
-        for key, part in value.items():
-            _check_values(f"{what}: {key}", part, texts)
-    elif isinstance(value, (list, tuple)):
-        for part in value:
-            _check_values(what, part, texts)
-    elif isinstance(value, ClassName) or not isinstance(value, (bool, int, float, str, type(None))):
-        raise UserError(f"{what} is refused: {value!r:.80} is no plain value")
-    elif isinstance(value, str) and not texts:
-        raise UserError(f"{what} is refused: what the text {value!r:.80} does there is not known")
+    left = [(what, value)]
+    for _ in range(MAX_VALUES):
+        if not left:
+            return
+        where, part = left.pop()
+        if isinstance(part, dict) and all(type(key) is str for key in part):
+            left += [(f"{what}: {key}", one) for key, one in part.items()]
+        elif isinstance(part, (list, tuple)):
+            left += [(where, one) for one in part]
+        elif isinstance(part, ClassName) or not isinstance(part, (bool, int, float, str, type(None))):
+            raise UserError(f"{where} is refused: {reprlib.repr(part)} is no plain value")
+        elif isinstance(part, str) and not texts:
+            raise UserError(f"{where} is refused: what the text {reprlib.repr(part)} does there is not known")
+    raise UserError(f"{what} is refused: more than {MAX_VALUES} values")

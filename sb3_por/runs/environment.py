@@ -1,6 +1,7 @@
 """Parts of a run's training environment, as its settings name them, and their import."""
 
 import ast
+import reprlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -130,7 +131,9 @@ def read_normalization(value: Any) -> bool | dict[str, Any]:
         return bool(parsed)
     if isinstance(parsed, dict) and all(isinstance(key, str) for key in parsed):
         return parsed or True
-    raise UserError(f"normalize must be True, False or arguments of VecNormalize, {{'norm_obs': False}}, got {value!r}")
+    raise UserError(
+        f"normalize must be True, False or arguments of VecNormalize, {{'norm_obs': False}}, got {reprlib.repr(value)}"
+    )
 
 
 class _DictCalls(ast.NodeTransformer):

@@ -1,5 +1,6 @@
 """Origin of a run's folder: whether this user's train.py made it, at this place."""
 
+import contextlib
 import hashlib
 import hmac
 import os
@@ -15,13 +16,14 @@ MARKER = ".origin"
 
 def mark_as_own(run: Path) -> None:
     """
-    Mark a run's folder as made here. Without a place for the user's key it stays unmarked.
+    Mark a run's folder as made here. Where the key or the mark cannot be written, it stays unmarked.
 
     :param run: The folder
     """
     key = _key(create=True)
     if key:
-        (run / MARKER).write_text(_tag(key, run))
+        with contextlib.suppress(OSError):
+            (run / MARKER).write_text(_tag(key, run))
 
 
 def is_own(run: Path) -> bool:

@@ -121,12 +121,15 @@ def without_paths(command: str) -> str:
     :param command: A training as it was typed, with the interpreter's path
     :return: The same as ``python train.py``, without the folder of logs and with the names of other files alone
     """
-    words = shlex.split(command)
+    try:
+        words = shlex.split(command)
+    except ValueError:  # a quotation mark in a word that was written without quotes
+        words = command.split()
     starts = [i for i, word in enumerate(words) if re.search(r"(^|/)(train\.py|sb3-por-train|zoo\.py)$|^sb3_por\.zoo$", word)]
     words = words[starts[0] + 1 :] if starts else words[1:]
     kept: list[str] = []
     for word, before in zip(words, ["", *words[:-1]], strict=True):
         if word in ("-f", "--log-folder") or before in ("-f", "--log-folder"):
             continue
-        kept.append(Path(word).name if word.startswith(("/", "~")) else word)
+        kept.append(re.sub(r"(^|[=:])[/~]\S*/", r"\1", word))
     return shlex.join(["python", "train.py", *kept])

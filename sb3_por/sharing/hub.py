@@ -21,8 +21,8 @@ from sb3_por.runs import folder as files
 from sb3_por.runs.folder import read_settings, write_settings
 from sb3_por.sharing import card
 
-#: Largest file that is pulled
-MAX_FILE = 2**30
+#: Largest file that is pulled, and largest file of settings
+MAX_FILE, MAX_SETTINGS = 2**30, 2**20
 #: Files of a card that are pulled as they are
 _SHOWN = (card.README, card.RESULTS, card.VIDEO, card.CURVE)
 _REPO = re.compile(r"[\w.-]+/[\w.-]+")
@@ -116,8 +116,9 @@ def _fetch(api: Any, repo: str, folder: Path) -> set[str]:
         known = {*_SHOWN, card.ARGUMENTS, card.HYPERPARAMETERS, card.METRICS, card.PICKLED_STATISTICS}
         names = {name for name in found if name in known or _NAME.fullmatch(name)}
         for name in sorted(names):
-            if found[name] > MAX_FILE:
-                raise UserError(f"{name} in {repo} is refused: it has more than {MAX_FILE >> 20} MiB")
+            limit = MAX_SETTINGS if name.endswith(".yml") else MAX_FILE
+            if found[name] > limit:
+                raise UserError(f"{name} in {repo} is refused: it has more than {limit >> 20} MiB")
             api.hf_hub_download(repo, name, local_dir=folder)
     return names
 

@@ -377,6 +377,8 @@ EVIL_WRAPPER = {"timeit.timeit": {"setup": "open('executed', 'w')", "number": 1}
         (dict(env_wrapper=[[["x"]]]), "the wrapper"),
         (dict(env_wrapper={"gymnasium.wrappers.ClipReward": {"min_reward": os.system}}), "is refused"),
         (dict(env_kwargs={"obs_type": SAC}), "env_kwargs: obs_type is refused"),
+        (dict(env_kwargs={"g": {1: SAC}}), "env_kwargs: g is refused"),
+        (dict(env_kwargs={"g": {SAC: 1}}), "env_kwargs: g is refused"),
     ],
 )
 @pytest.mark.parametrize("place", ["model", "folder"])
@@ -399,6 +401,21 @@ def test_what_the_environment_would_run_is_refused(place, environment, message, 
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.parametrize("name", ["env_wrapper", "env_kwargs", "vec_env_wrapper", "normalize", "frame_stack", "gym_packages"])
+def test_few_lines_of_settings_that_are_a_great_many_values_are_refused(name, sac_zip, tmp_path):
+    levels = [f"l{i}: &l{i} [*l{i - 1}, *l{i - 1}]" for i in range(1, 40)]
+    clip = "{gymnasium.wrappers.ClipReward: {min_reward: *l39}}"
+    value = {"env_wrapper": clip, "env_kwargs": "{x: *l39}", "vec_env_wrapper": "[*l39]"}.get(name, "*l39")
+    settings = "\n".join(["l0: &l0 [1]", *levels, f"{name}: {value}"])
+    shutil.copy(sac_zip, tmp_path / "model.zip")
+    (tmp_path / "Pendulum-v1").mkdir()
+    (tmp_path / "Pendulum-v1" / ("args.yml" if name == "gym_packages" else "config.yml")).write_text(settings)
+    env_id = "Evil-v0" if name == "gym_packages" else "Pendulum-v1"
+    with pytest.raises(UserError) as error:
+        resolve(tmp_path / "model.zip", env_id, safe=True)
+    assert len(str(error.value)) < 1500
+
+
 def test_packages_that_a_folder_names_are_not_imported(sac_zip, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
@@ -407,7 +424,7 @@ def test_packages_that_a_folder_names_are_not_imported(sac_zip, tmp_path, monkey
     (tmp_path / "Pendulum-v1").mkdir()
     (tmp_path / "Pendulum-v1" / "args.yml").write_text(yaml.safe_dump({"gym_packages": ["evil_package"]}))
     resolve("model.zip", "Pendulum-v1", safe=True)
-    with pytest.raises(UserError, match="does not import the run's package 'evil_package'"):
+    with pytest.raises(UserError, match=r"does not import the packages of the run, \['evil_package'\]"):
         resolve("model.zip", "Evil-v0", safe=True)
     assert not (tmp_path / "executed").exists()
 

@@ -148,6 +148,8 @@ def test_what_cannot_be_loaded_safely_is_not_exported(run, tmp_path, capsys):
         ("/home/u/.venv/bin/python train.py --algo sac_por --env PourWater-v0", "--algo sac_por --env PourWater-v0"),
         ("/home/u/python -m sb3_por.zoo --algo sac -f /data/logs --env 'X-v0'", "--algo sac --env X-v0"),
         ("sb3-por-train --conf-file /home/u/mine.yml --env X-v0", "--conf-file mine.yml --env X-v0"),
+        ("python train.py --conf-file=/home/u/mine.yml --storage mysql://host/db", "--conf-file=mine.yml --storage mysql:db"),
+        ("python train.py -params 'k:1", """-params ''"'"'k:1'"""),
         ('python /home/u/code/train.py -params "k:[1, 2]"', "-params 'k:[1, 2]'"),
     ],
 )

@@ -34,6 +34,8 @@ LOG = "log.txt"
 ARGUMENTS = "args.yml"
 #: Hyperparameters
 HYPERPARAMETERS = "config.yml"
+#: Arguments of the environment, in repositories of the hub
+ENV_KWARGS = "env_kwargs.yml"
 #: The command as it was typed
 COMMAND = "command.txt"
 #: ``VecNormalize`` statistics of the last model, and those of the best one

@@ -20,13 +20,12 @@ from sb3_por.evaluation.plain_files import DATA, STATISTICS
 from sb3_por.evaluation.video import record_video
 from sb3_por.runs import folder as files
 from sb3_por.runs.facts import run_identity
-from sb3_por.runs.folder import read_settings, run_arguments, write_settings
+from sb3_por.runs.folder import ARGUMENTS, ENV_KWARGS, HYPERPARAMETERS, read_settings, run_arguments, write_settings
 from sb3_por.sharing.agents import agent_name, describe_evaluation
 from sb3_por.sharing.export import load_run, open_run, run_facts
 
 #: Files of a card besides the model, by the names that the RL Zoo gives them
 README, RESULTS, VIDEO, CURVE = "README.md", "results.json", "replay.mp4", "curve.png"
-ARGUMENTS, HYPERPARAMETERS, ENV_KWARGS = "args.yml", "config.yml", "env_kwargs.yml"
 METRICS, PICKLED_STATISTICS = "train_eval_metrics.zip", "vec_normalize.pkl"
 #: Arguments of train.py that name places of the machine
 PLACES = (
@@ -57,7 +56,7 @@ def write_card(run: str | Path, folder: Path, repo: str, n_episodes: int = 10) -
     if pickled is not None:
         shutil.copy(pickled, folder / PICKLED_STATISTICS)
     write_settings(folder / ARGUMENTS, {key: value for key, value in arguments.items() if key not in PLACES})
-    hyperparameters = read_settings(settings / files.HYPERPARAMETERS)
+    hyperparameters = read_settings(settings / HYPERPARAMETERS)
     write_settings(folder / HYPERPARAMETERS, hyperparameters)
     write_settings(folder / ENV_KWARGS, hyperparameters.get("env_kwargs") or {})
     _write_metrics(run, folder / METRICS)

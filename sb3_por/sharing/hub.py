@@ -72,14 +72,14 @@ def pull(repo: str, folder: str | Path, env: str | None = None, unsafe: bool = F
         names = _fetch(api, repo, fetched)
         model = _the_model(repo, names)
         algo, _, env_name = model.removesuffix(".zip").partition("-")
-        arguments = _settings(fetched / card.ARGUMENTS)
+        arguments = _settings(fetched / files.ARGUMENTS)
         named = arguments["env"] if isinstance(arguments.get("env"), str) else env_name
         env_id = find_environment(env or named.rpartition(":")[2])  # a stranger's package is not imported
         (run / env_id).mkdir(parents=True)
         shutil.move(fetched / model, run / files.BEST_MODEL)
-        for source, target in ((card.ARGUMENTS, files.ARGUMENTS), (card.HYPERPARAMETERS, files.HYPERPARAMETERS)):
-            if settings := _settings(fetched / source):
-                write_settings(run / env_id / target, settings)
+        for name in (files.ARGUMENTS, files.HYPERPARAMETERS):
+            if settings := _settings(fetched / name):
+                write_settings(run / env_id / name, settings)
         for name in filter(names.__contains__, _SHOWN):
             shutil.move(fetched / name, run / name)
         _take_evaluations(fetched / card.METRICS, run)
@@ -113,7 +113,7 @@ def _fetch(api: Any, repo: str, folder: Path) -> set[str]:
     """Fetch the files of a card, whose names are known here; returns those that there are."""
     with _hub_errors(repo):
         found = {one.rfilename: one.size or 0 for one in api.model_info(repo, files_metadata=True).siblings or []}
-        known = {*_SHOWN, card.ARGUMENTS, card.HYPERPARAMETERS, card.METRICS, card.PICKLED_STATISTICS}
+        known = {*_SHOWN, files.ARGUMENTS, files.HYPERPARAMETERS, card.METRICS, card.PICKLED_STATISTICS}
         names = {name for name in found if name in known or _NAME.fullmatch(name)}
         for name in sorted(names):
             limit = MAX_SETTINGS if name.endswith(".yml") else MAX_FILE

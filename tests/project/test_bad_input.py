@@ -136,8 +136,7 @@ def test_damaged_models(model, tmp_path, data):
                 content = whole.read(name)
                 if name != lost:
                     part.writestr(name, content[: data.draw(st.integers(0, len(content) // 2))] if name == cut else content)
-    safe = data.draw(st.sampled_from([[], ["--safe"]]))
-    assert_refused(*outcome(main, ["evaluate", "--model", str(file), "--env", "FallingBall-v0", *safe]))
+    assert_refused(*outcome(main, ["evaluate", "--model", str(file), "--env", "FallingBall-v0"]))
 
 
 @EXAMPLES

@@ -7,6 +7,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+SOAK ?= 60
 
 # The first interpreter that pybullet or its fork has wheels for; PYTHON=... names another. The original draws faster.
 SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))
@@ -15,7 +16,7 @@ PYTHON ?= $(shell for p in python3.11 python3.10 python3.13 python3.12 python3 p
 
 export MPLBACKEND := Agg
 
-.PHONY: train test demo docs lint format type bench
+.PHONY: train test demo docs lint format type bench soak
 
 train: $(VENV)/.installed-test
 	$(BIN)/python train.py --algo sac_por --env PourWater-v0 $(ARGS)
@@ -52,7 +53,10 @@ type: $(VENV)/.installed-dev
 	$(BIN)/mypy
 
 bench: $(VENV)/.installed-test
-	for benchmark in benchmarks/*.py; do $(BIN)/python $$benchmark $(ARGS) || exit; done
+	for benchmark in $(filter-out benchmarks/soak.py,$(wildcard benchmarks/*.py)); do $(BIN)/python $$benchmark $(ARGS) || exit; done
+
+soak: $(VENV)/.installed-test
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/soak.py --minutes $(SOAK) $(ARGS)
 
 # One stamp for each set of extras: installed again only when setup.cfg or constraints.txt changed.
 $(VENV)/.installed-test: EXTRAS := test,docs

@@ -41,31 +41,48 @@ from softbody_envs.sim import cloth, rope
 
 #: Water is inside if it is no farther away than this, m: particles that were spilled roll without friction.
 MAX_WATER_DISTANCE = 20.0
-EXTREMES = ("rope_stretch", "edge_stretch", "water_distance")
+#: Largest relative change of the rope's length, longest edge of the cloth in rest lengths, farthest particle in m
+LIMITS = {"rope_stretch": rope.MAX_STRETCH, "edge_stretch": cloth.MAX_STRETCH, "water_distance": MAX_WATER_DISTANCE}
+EXTREMES = tuple(LIMITS)
+COUNTS = ("steps", "episodes", "reported", "unreported", "nan")
 
 
 class Audited(gym.Wrapper):
-    """Looks at Bullet's own positions after every step, and puts what it finds into ``info["audit"]``."""
+    """
+    Looks at Bullet's own positions after every step. ``info["audit"]`` has what was found since the environment was made, so
+    that a wrapper that repeats actions hides nothing.
+
+    :param env: One of the tasks
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.counts = dict.fromkeys(COUNTS, 0)
+        self.extremes = dict.fromkeys(EXTREMES, np.nan)
 
     def reset(self, **kwargs: Any) -> Any:
         observation, info = self.env.reset(**kwargs)
-        return observation, info | {"audit": self._audit(observation, 0.0, None)}
+        self._audit(observation, 0.0, reported=False)
+        return observation, info
 
     def step(self, action: Any) -> Any:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, info | {"audit": self._audit(observation, reward, info)}
+        self.counts["steps"] += 1
+        self.counts["episodes"] += terminated or truncated
+        self._audit(observation, reward, reported="sim_error" in info)
+        return observation, reward, terminated, truncated, info | {"audit": self.counts | self.extremes}
 
-    def _audit(self, observation: Any, reward: Any, info: dict[str, Any] | None) -> dict[str, float]:
+    def _audit(self, observation: Any, reward: Any, reported: bool) -> None:
         parts = observation.values() if isinstance(observation, dict) else [observation]
-        reported = info is not None and "sim_error" in info
-        found = {"nan": not all(np.isfinite(part).all() for part in [*parts, reward]), "reported": reported}
-        extremes = {} if reported else self._extremes()
-        limits = {"rope_stretch": rope.MAX_STRETCH, "edge_stretch": cloth.MAX_STRETCH, "water_distance": MAX_WATER_DISTANCE}
-        unreported = any(not value <= limits[name] for name, value in extremes.items())
-        return found | extremes | {"unreported": unreported}
+        self.counts["nan"] += not all(np.isfinite(part).all() for part in [*parts, reward])
+        self.counts["reported"] += reported
+        if not reported:
+            found = self._extremes()
+            self.counts["unreported"] += any(not value <= LIMITS[name] for name, value in found.items())
+            self.extremes |= {name: float(np.fmax(self.extremes[name], value)) for name, value in found.items()}
 
     def _extremes(self) -> dict[str, float]:
-        """What the task has of: relative change of the rope's length, longest edge in rest lengths, farthest particle in m."""
+        """Those that the task has now."""
         task: Any = self.unwrapped
         found = {}
         if hasattr(task, "rope"):
@@ -153,24 +170,18 @@ def plays(n_workers: int, models: list[Path]) -> list[tuple[str, str, str, Calla
 
 def play(env: VecEnv, policy: Any, n_episodes: int) -> dict[str, float]:
     """
-    Play whole episodes.
+    Play until at least so many episodes are done.
 
-    :return: numbers of control steps, episodes and faults, and the extremes
+    :return: ``COUNTS`` and ``EXTREMES`` of all environments
     """
-    counts = dict.fromkeys(("steps", "episodes", "reported", "unreported", "nan"), 0.0)
-    extremes = dict.fromkeys(EXTREMES, np.nan)
-    observations, dones = env.reset(), np.ones(env.num_envs, bool)
-    while counts["episodes"] < n_episodes:
+    observations, dones, n_done = env.reset(), np.ones(env.num_envs, bool), 0
+    while n_done < n_episodes:
         observations, _, dones, infos = env.step(policy.act(observations, dones))
-        for info in infos:
-            audit = info["audit"]
-            counts["steps"] += info.get("control_steps", 1)
-            for name in ("reported", "unreported", "nan"):
-                counts[name] += audit[name]
-            for name in EXTREMES:
-                extremes[name] = np.fmax(extremes[name], audit.get(name, np.nan))
-        counts["episodes"] += int(np.sum(dones))
-    return counts | extremes
+        n_done += int(np.sum(dones))
+    audits = [info["audit"] for info in infos]
+    return {name: sum(audit[name] for audit in audits) for name in COUNTS} | {
+        name: np.fmax.reduce([audit[name] for audit in audits]) for name in EXTREMES
+    }
 
 
 def resources(folder: str) -> dict[str, float]:
@@ -205,8 +216,7 @@ def soak(minutes: float, n_workers: int, models: list[Path], folder: str) -> tup
         rounds.append({"minutes": round((time.monotonic() - begin) / 60, 2), "steps": steps, **resources(folder)})
         print(rounds[-1], flush=True)
     table = pd.DataFrame([{"env": env_id, "policy": name, **values} for (env_id, name), values in totals.items()])
-    counts = ["steps", "episodes", "reported", "unreported", "nan"]
-    return pd.DataFrame(rounds).astype({"steps": int}), table.astype(dict.fromkeys(counts, int)).round(3)
+    return pd.DataFrame(rounds).astype({"steps": int}), table.astype(dict.fromkeys(COUNTS, int)).round(3)
 
 
 def summary(rounds: pd.DataFrame, table: pd.DataFrame) -> str:

@@ -5,6 +5,8 @@ import fcntl
 import itertools
 import os
 import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -346,3 +348,19 @@ def test_a_file_system_without_locks_is_said_and_used(code, tmp_path, monkeypatc
         assert note in capsys.readouterr().err
     assert take_inventory([run])[0].state == "finished"
     assert main(["--resume", str(run), "-n", "90"]) == 0
+
+
+@pytest.mark.slow
+def test_a_shared_memory_that_is_too_small_is_not_missed(tmp_path):
+    """Containers have 64 MB in /dev/shm, or less: here 64 KiB, in a mount namespace of its own."""
+    flags = ["-n", "160", "--eval-freq", "80", "--save-freq", "60", "-f", str(tmp_path), *TWO_WORKERS]
+    words = " ".join(map(shlex.quote, [sys.executable, "train.py", *SAC, *flags]))
+    script = f"mount -t tmpfs -o size=64k tmpfs /dev/shm || exit 77; {words}"
+    command = ["unshare", "--mount", "bash", "-c", script]
+    if shutil.which("unshare") is None:
+        pytest.skip("unshare is not installed")
+    done = subprocess.run(command, cwd=ROOT, env=ENV, capture_output=True, text=True, timeout=240)
+    if done.returncode == 77 or "unshare" in done.stderr:
+        pytest.skip(f"no mount namespace: {done.stderr.strip()}")
+    assert done.returncode == 0, done.stderr
+    assert load_model(tmp_path / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip").num_timesteps == 160

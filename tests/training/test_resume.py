@@ -4,6 +4,7 @@ import math
 import os
 import pickle
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 import yaml
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
@@ -180,15 +182,60 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_run_killed_at_ten_random_moments_ends_like_an_uninterrupted_one(tmp_path):
+@pytest.mark.timeout(3000)
+def test_a_run_killed_at_thirty_random_moments_ends_like_an_uninterrupted_one(tmp_path):
     assert main([*FLAGS, *OFTEN, "-f", str(tmp_path / "whole"), *SMALL]) == 0
     whole = tmp_path / "whole" / "sac" / "Pendulum-v1_1"
     assert_finished(whole)
-    killed = kill_and_finish(tmp_path / "killed", 10, random.Random(1))
+    killed = kill_and_finish(tmp_path / "killed", 30, random.Random(1))
     assert_finished(killed)
     with np.load(whole / "evaluations.npz") as first, np.load(killed / "evaluations.npz") as second:
         assert {name: first[name].shape for name in first} == {name: second[name].shape for name in second}
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_bit_for_bit_as_one_that_was_stopped_at_its_last_checkpoint(tmp_path, monkeypatch):
+    """Whatever the kill destroyed, and however often it is resumed."""
+    flags = [*FLAGS, "-n", "330", "--save-freq", "150", "--eval-freq", "110", "--eval-episodes", "1", "--save-replay-buffer"]
+
+    def end_at(step, how):
+        def end(callback):
+            if callback.num_timesteps == step:
+                how(callback)
+            return True
+
+        return end
+
+    def kill(callback):
+        raise RuntimeError("killed")
+
+    def stop(callback):
+        callback.stop_requested = True
+
+    runs = {}
+    for name, step, how in (("killed", 222, kill), ("stopped", 150, stop)):
+        with monkeypatch.context() as patch:
+            patch.setattr("sb3_por.training.experiment.CheckpointCallback._on_step", end_at(step, how))
+            command = [*flags, "-f", str(tmp_path / name), *SMALL]
+            if how is kill:
+                with pytest.raises(RuntimeError, match="killed"):
+                    main(command)
+            else:
+                assert main(command) == 130
+        runs[name] = tmp_path / name / "sac" / "Pendulum-v1_1"
+        assert latest_checkpoint(runs[name]).name == "step_150"
+    runs["copy"] = tmp_path / "copy" / "Pendulum-v1_1"
+    shutil.copytree(runs["killed"], runs["copy"])
+    for run in runs.values():
+        assert main(["--resume", str(run)]) == 0
+    expected = load_model(runs["stopped"] / "Pendulum-v1.zip").policy.state_dict()
+    buffers = [pickle.loads((run / "replay_buffer.pkl").read_bytes()) for run in runs.values()]
+    for run, buffer in zip(runs.values(), buffers, strict=True):
+        weights = load_model(run / "Pendulum-v1.zip").policy.state_dict()
+        assert all(th.equal(value, expected[name]) for name, value in weights.items()), run
+        assert same_buffer(buffer, buffers[0])
+        with np.load(run / "evaluations.npz") as first, np.load(runs["stopped"] / "evaluations.npz") as second:
+            assert all(np.array_equal(first[name], second[name], True) for name in first if name != "wall_clock_s")
 
 
 def test_a_resumed_run_forgets_the_episodes_that_it_plays_again_and_removes_half_a_file(tmp_path, monkeypatch):

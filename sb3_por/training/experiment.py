@@ -293,8 +293,11 @@ class Experiment(ExperimentManager):
         return f"the last checkpoint is {checkpoint}, resume from it with: {command}"
 
     def _request_stop(self, number: int, frame: Any) -> None:
-        """The first signal waits for a safe place, the second does not."""
-        if self._checkpoints.stop_requested:
+        """
+        A signal waits for a safe place, a second Ctrl-C does not. A second SIGTERM changes nothing: a run of a suite gets one from
+        the cluster, like every process of the job, and one from the suite.
+        """
+        if self._checkpoints.stop_requested and number == signal.SIGINT:
             raise KeyboardInterrupt
         self._checkpoints.stop_requested = True
 

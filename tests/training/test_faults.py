@@ -222,7 +222,7 @@ TWO_WORKERS = ["--vec-env", "subproc", "-params", "n_envs:2", *SMALL[1:]]
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", [0.0, 0.1, 0.3])
 def test_a_run_that_loses_a_worker_says_so_and_is_resumed(moment, tmp_path):
-    flags = ["-n", "100000", "--eval-freq", "-1", "--save-freq", "60", "-f", tmp_path]
+    flags = ["-n", "1500", "--eval-freq", "-1", "--save-freq", "60", "-f", tmp_path]
     process = start(*SAC, *flags, *TWO_WORKERS)
     run = tmp_path / "sac" / "Pendulum-v1_1"
     wait_for(lambda: latest_checkpoint(run))
@@ -236,16 +236,30 @@ def test_a_run_that_loses_a_worker_says_so_and_is_resumed(moment, tmp_path):
     assert process.returncode == 2, errors
     assert "environment processes was killed by SIGKILL; is there enough memory for all of them?; the last checkpoint" in said
     assert "Traceback" not in errors
-    step = int(latest_checkpoint(run).name.removeprefix("step_"))
-    assert main(["--resume", str(run), "-n", str(step + 20)]) == 0
-    assert load_model(run / "Pendulum-v1.zip").num_timesteps >= step + 20
+    assert main(["--resume", str(run)]) == 0
+    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 1500
+
+
+def test_a_second_sigterm_does_not_cut_the_checkpoint_short(tmp_path, at, capsys):
+    """A run of a suite gets one from the cluster and one from the suite."""
+
+    def terminate_twice(callback):
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+
+    at(step_70=terminate_twice)
+    assert main([*SAC, "-n", "100", "--eval-freq", "-1", "-f", str(tmp_path), *SMALL]) == 130
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    assert last_line(capsys) == f"train.py: interrupted at step 70; resume with: python train.py --resume {run}"
+    assert latest_checkpoint(run).name == "step_70"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_to_all_processes_of_a_run_saves_a_checkpoint(number, tmp_path):
     """As Slurm's scancel and Ctrl-C in a terminal send it."""
-    flags = ["-n", "100000", "--eval-freq", "-1", "--save-freq", "0", "-f", tmp_path]
+    flags = ["-n", "1500", "--eval-freq", "-1", "--save-freq", "0", "-f", tmp_path]
     process = start(*SAC, *flags, *TWO_WORKERS)
     run = tmp_path / "sac" / "Pendulum-v1_1"
     wait_for(lambda: (run / "0.monitor.csv").is_file() and len((run / "0.monitor.csv").read_text().splitlines()) > 2)
@@ -255,7 +269,8 @@ def test_a_signal_to_all_processes_of_a_run_saves_a_checkpoint(number, tmp_path)
     assert process.returncode == 130, errors
     step = int(latest_checkpoint(run).name.removeprefix("step_"))
     assert errors.splitlines()[-1] == f"train.py: interrupted at step {step}; resume with: python train.py --resume {run}"
-    assert main(["--resume", str(run), "-n", str(step + 20)]) == 0
+    assert main(["--resume", str(run)]) == 0
+    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 1500
 
 
 # -- numbers that are not finite -------------------------------------------------------------------------------------------

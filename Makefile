@@ -2,6 +2,7 @@
 # make test    set up and run the tests:        make test ARGS="-k plots"
 # make demo    a small run from training to a curve and a GIF, within 10 minutes on two CPU cores
 # make docs    build the documentation site into site/
+# make soak    play all tasks for an hour (SOAK=15: 15 minutes) and audit the physics and the process
 # make lint, make format, make type, make bench
 
 VENV := .venv

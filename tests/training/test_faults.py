@@ -194,7 +194,7 @@ def test_workers_end_with_a_process_that_does_not_close_them(tmp_path):
         "    env = WorkerProcesses([partial(gymnasium.make, 'Pendulum-v1')] * 2)\n    env.reset()\n"
         "    print(*(process.pid for process in env.processes), flush=True)\n    1 / 0\n"
     )
-    done = subprocess.run([sys.executable, script], env=ENV, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, script], env=ENV, capture_output=True, text=True, timeout=240)
     assert "ZeroDivisionError" in done.stderr
     assert not any(psutil.pid_exists(int(pid)) for pid in done.stdout.split())
 
@@ -231,7 +231,7 @@ def test_a_run_that_loses_a_worker_says_so_and_is_resumed(moment, tmp_path):
     of_server = [child for child in psutil.Process(process.pid).children(recursive=True) if not child.children()]
     victim = max(of_server, key=lambda child: child.create_time())
     victim.kill()
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=240)
     said = errors.splitlines()[-1]
     assert process.returncode == 2, errors
     assert "environment processes was killed by SIGKILL; is there enough memory for all of them?; the last checkpoint" in said
@@ -265,7 +265,7 @@ def test_a_signal_to_all_processes_of_a_run_saves_a_checkpoint(number, tmp_path)
     wait_for(lambda: (run / "0.monitor.csv").is_file() and len((run / "0.monitor.csv").read_text().splitlines()) > 2)
     assert latest_checkpoint(run) is None
     os.killpg(process.pid, number)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=240)
     assert process.returncode == 130, errors
     step = int(latest_checkpoint(run).name.removeprefix("step_"))
     assert errors.splitlines()[-1] == f"train.py: interrupted at step {step}; resume with: python train.py --resume {run}"

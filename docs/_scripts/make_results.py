@@ -30,6 +30,7 @@ PAGES = (
     "lab/full_speed.md",
     "lab/trials.md",
     "por.md",
+    "reliability.md",
     "algorithms/tqc_por.md",
     "algorithms/sac_mrq.md",
     *(f"algorithms/{algo}.md" for algo in ALGOS),
@@ -246,6 +247,35 @@ def leak() -> str:
     return markdown(head, rows)
 
 
+def soak() -> str:
+    """Tabulate what has been played, and what the audit of the physics has found."""
+    table = pd.read_csv(RESULTS / "soak" / "one_process_plays.csv")
+    rows = []
+    for row in table.itertuples():
+        extremes = {
+            "rope {:.1%} longer or shorter": row.rope_stretch,
+            "an edge {:.2f} times its length": row.edge_stretch,
+            "water {:.1f} m away": row.water_distance,
+        }
+        farthest = "".join(text.format(value) for text, value in extremes.items() if not np.isnan(value))
+        counts = (str(n) for n in (row.steps, row.episodes, row.reported, row.unreported, row.nan))
+        rows.append((f"`{row.env}`", row.policy, *counts, farthest))
+    totals = (str(table[name].sum()) for name in ("steps", "episodes", "reported", "unreported", "nan"))
+    head = ("task", "policy", "control steps", "episodes", "explosions, reported", "unreported", "NaN", "at most")
+    return markdown(head, [*rows, ("all", "", *totals, "")])
+
+
+def soak_process() -> str:
+    """Tabulate what the process held after the first and after the last round over all tasks."""
+    rounds = pd.read_csv(RESULTS / "soak" / "one_process_rounds.csv")
+    head = ("after control steps", "minutes", "memory, MB", "file descriptors", "threads", "temporary files")
+    ends = rounds.iloc[[0, -1]] if len(rounds) > 1 else rounds
+    cells = zip(
+        *(ends[name].astype(int).astype(str) for name in ("steps", "minutes", "memory_mb", *rounds.columns[3:])), strict=True
+    )
+    return markdown(head, cells)
+
+
 def scores_of(algo: str) -> str:
     """Tabulate what one algorithm has reached in the suites that compare algorithms."""
     rows = []
@@ -295,6 +325,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "diagnosis": lambda: diagnosis("main"),
     "diagnosis_full_speed": lambda: diagnosis("full_speed"),
     "leak": leak,
+    "soak": soak,
+    "soak_process": soak_process,
     "metrics_por": lambda: metrics_of("por"),
     "metrics_curl": lambda: metrics_of("curl"),
     "metrics_spr": lambda: metrics_of("spr"),

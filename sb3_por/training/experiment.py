@@ -294,8 +294,8 @@ class Experiment(ExperimentManager):
 
     def _request_stop(self, number: int, frame: Any) -> None:
         """
-        A signal waits for a safe place, a second Ctrl-C does not. A second SIGTERM changes nothing: a run of a suite gets one from
-        the cluster, like every process of the job, and one from the suite.
+        A signal waits for a safe place, a second Ctrl-C does not. A second SIGTERM changes nothing: a run of a suite gets one
+        from the cluster, like every process of the job, and one from the suite.
         """
         if self._checkpoints.stop_requested and number == signal.SIGINT:
             raise KeyboardInterrupt

@@ -35,10 +35,10 @@ from sb3_por.training.zoo import main
 
 ROOT = Path(__file__).parents[2]
 PENDULUM = ["--env", "Pendulum-v1", "--seed", "1", "--num-threads", "1", "--eval-episodes", "1"]
-SMALL = ["-params", "learning_starts:50", "buffer_size:500", "batch_size:16"]
+SMALL = ["-params", "learning_starts:50", "buffer_size:500", "batch_size:16", "policy_kwargs:{'net_arch':[16]}"]
 SAC = ["--algo", "sac", *PENDULUM]
 POR = ["--algo", "sac_por", *PENDULUM]
-POR_SMALL = [*SMALL, "policy:MlpPolicy", "n_timesteps:300", "policy_kwargs:{'net_arch':[8]}"]
+POR_SMALL = [*SMALL, "policy:MlpPolicy", "n_timesteps:300"]
 
 
 class At(BaseCallback):
@@ -220,9 +220,9 @@ TWO_WORKERS = ["--vec-env", "subproc", "-params", "n_envs:2", *SMALL[1:]]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", [0.0, 0.1, 0.3])
+@pytest.mark.parametrize("moment", [0.0, 0.2])
 def test_a_run_that_loses_a_worker_says_so_and_is_resumed(moment, tmp_path):
-    flags = ["-n", "1500", "--eval-freq", "-1", "--save-freq", "60", "-f", tmp_path]
+    flags = ["-n", "1200", "--eval-freq", "-1", "--save-freq", "60", "-f", tmp_path]
     process = start(*SAC, *flags, *TWO_WORKERS)
     run = tmp_path / "sac" / "Pendulum-v1_1"
     wait_for(lambda: latest_checkpoint(run))
@@ -237,7 +237,7 @@ def test_a_run_that_loses_a_worker_says_so_and_is_resumed(moment, tmp_path):
     assert "environment processes was killed by SIGKILL; is there enough memory for all of them?; the last checkpoint" in said
     assert "Traceback" not in errors
     assert main(["--resume", str(run)]) == 0
-    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 1500
+    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 1200
 
 
 def test_a_second_sigterm_does_not_cut_the_checkpoint_short(tmp_path, at, capsys):
@@ -259,7 +259,7 @@ def test_a_second_sigterm_does_not_cut_the_checkpoint_short(tmp_path, at, capsys
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_to_all_processes_of_a_run_saves_a_checkpoint(number, tmp_path):
     """As Slurm's scancel and Ctrl-C in a terminal send it."""
-    flags = ["-n", "1500", "--eval-freq", "-1", "--save-freq", "0", "-f", tmp_path]
+    flags = ["-n", "1200", "--eval-freq", "-1", "--save-freq", "0", "-f", tmp_path]
     process = start(*SAC, *flags, *TWO_WORKERS)
     run = tmp_path / "sac" / "Pendulum-v1_1"
     wait_for(lambda: (run / "0.monitor.csv").is_file() and len((run / "0.monitor.csv").read_text().splitlines()) > 2)
@@ -270,7 +270,7 @@ def test_a_signal_to_all_processes_of_a_run_saves_a_checkpoint(number, tmp_path)
     step = int(latest_checkpoint(run).name.removeprefix("step_"))
     assert errors.splitlines()[-1] == f"train.py: interrupted at step {step}; resume with: python train.py --resume {run}"
     assert main(["--resume", str(run)]) == 0
-    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 1500
+    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 1200
 
 
 # -- numbers that are not finite -------------------------------------------------------------------------------------------

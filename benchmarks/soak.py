@@ -18,7 +18,7 @@ import argparse
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -195,9 +195,9 @@ def resources(folder: str) -> dict[str, float]:
     }
 
 
-def soak(minutes: float, n_workers: int, models: list[Path], folder: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+def soak(minutes: float, n_workers: int, models: list[Path], folder: str) -> Iterator[tuple[pd.DataFrame, pd.DataFrame]]:
     """
-    :return: a row for each round, and a row for each task and policy
+    :return: after each round, a row for each round so far, and a row for each task and policy
     """
     begin = time.monotonic()
     todo = plays(n_workers, models)
@@ -215,8 +215,8 @@ def soak(minutes: float, n_workers: int, models: list[Path], folder: str) -> tup
                 total[name] = np.fmax(total[name], value) if name in EXTREMES else total[name] + value
         rounds.append({"minutes": round((time.monotonic() - begin) / 60, 2), "steps": steps, **resources(folder)})
         print(rounds[-1], flush=True)
-    table = pd.DataFrame([{"env": env_id, "policy": name, **values} for (env_id, name), values in totals.items()])
-    return pd.DataFrame(rounds).astype({"steps": int}), table.astype(dict.fromkeys(COUNTS, int)).round(3)
+        table = pd.DataFrame([{"env": env_id, "policy": name, **values} for (env_id, name), values in totals.items()])
+        yield pd.DataFrame(rounds).astype({"steps": int}), table.astype(dict.fromkeys(COUNTS, int)).round(3)
 
 
 def summary(rounds: pd.DataFrame, table: pd.DataFrame) -> str:
@@ -257,9 +257,9 @@ def main() -> None:
     if not arguments.plot:
         with tempfile.TemporaryDirectory() as folder:
             tempfile.tempdir = os.environ["TMPDIR"] = folder  # temporary files of nobody else
-            tables = soak(arguments.minutes, arguments.workers, arguments.models, folder)
-        for table, file in zip(tables, files, strict=True):
-            table.to_csv(file, index=False)
+            for tables in soak(arguments.minutes, arguments.workers, arguments.models, folder):
+                for table, file in zip(tables, files, strict=True):
+                    table.to_csv(file, index=False)
     rounds, table = (pd.read_csv(file) for file in files)
     draw(rounds, arguments.output / f"{name}.png")
     print(summary(rounds, table))

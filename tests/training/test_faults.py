@@ -203,13 +203,23 @@ def test_workers_end_with_a_process_that_does_not_close_them(tmp_path):
 ENV = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
 
-def start(*words):
-    """Start train.py in a process group of its own."""
-    command = [sys.executable, "train.py", *map(str, words)]
-    return subprocess.Popen(command, cwd=ROOT, env=ENV, stderr=subprocess.PIPE, text=True, start_new_session=True)
+@pytest.fixture
+def start():
+    """Starts train.py in a process group of its own; it does not outlive the test."""
+    started = []
+
+    def popen(*words):
+        command = [sys.executable, "train.py", *map(str, words)]
+        started.append(subprocess.Popen(command, cwd=ROOT, env=ENV, stderr=subprocess.PIPE, text=True, start_new_session=True))
+        return started[-1]
+
+    yield popen
+    for process in started:
+        process.kill()
+        process.communicate()
 
 
-def wait_for(condition, seconds=120):
+def wait_for(condition, seconds=250):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not happen"
@@ -221,7 +231,7 @@ TWO_WORKERS = ["--vec-env", "subproc", "-params", "n_envs:2", *SMALL[1:]]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", [0.0, 0.2])
-def test_a_run_that_loses_a_worker_says_so_and_is_resumed(moment, tmp_path):
+def test_a_run_that_loses_a_worker_says_so_and_is_resumed(moment, tmp_path, start):
     flags = ["-n", "1200", "--eval-freq", "-1", "--save-freq", "60", "-f", tmp_path]
     process = start(*SAC, *flags, *TWO_WORKERS)
     run = tmp_path / "sac" / "Pendulum-v1_1"
@@ -257,7 +267,7 @@ def test_a_second_sigterm_does_not_cut_the_checkpoint_short(tmp_path, at, capsys
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_to_all_processes_of_a_run_saves_a_checkpoint(number, tmp_path):
+def test_a_signal_to_all_processes_of_a_run_saves_a_checkpoint(number, tmp_path, start):
     """As Slurm's scancel and Ctrl-C in a terminal send it."""
     flags = ["-n", "1200", "--eval-freq", "-1", "--save-freq", "0", "-f", tmp_path]
     process = start(*SAC, *flags, *TWO_WORKERS)

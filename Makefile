@@ -1,6 +1,6 @@
 # make train   set up and train POR on pouring: make train ARGS="-n 2500 --seed 1"
 # make test    set up and run the tests:        make test ARGS="-k plots"
-# make demo    a small run from training to a curve and a GIF, within 10 minutes on two CPU cores
+# make demo    a small run from training to a curve and a GIF, within 5 minutes on two CPU cores
 # make docs    build the documentation site into site/
 # make soak    play all tasks for an hour (SOAK=15: 15 minutes) and audit the physics and the process
 # make lint, make format, make type, make bench
@@ -29,7 +29,7 @@ DEMO := demo/$(shell date +%Y%m%d-%H%M%S)
 DEMO_RUN := $(DEMO)/sac_por/PourWater-v0_1
 
 demo: $(VENV)/.installed-test
-	$(BIN)/python train.py --algo sac_por --env PourWater-v0 --seed 1 -n 1200 --eval-freq 400 --eval-episodes 5 \
+	$(BIN)/python train.py --algo sac_por --env PourWater-v0 --seed 1 -n 1000 --eval-freq 200 --eval-episodes 5 \
 		-f $(DEMO) -params learning_starts:600 buffer_size:3000 $(ARGS)
 	$(BIN)/python -m sb3_por evaluate --model $(DEMO_RUN)/best_model.zip --env PourWater-v0 -n 10
 	$(BIN)/python -m sb3_por plot $(DEMO_RUN) -o $(DEMO)/curve.png

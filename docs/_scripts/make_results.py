@@ -317,6 +317,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "trials": lambda: evaluations("trials"),
     "progress": lambda: evaluations("progress"),
     "pour": lambda: evaluations("pour"),
+    "demos": lambda: evaluations("demos"),
     "rope": lambda: evaluations("rope"),
     "fold": lambda: evaluations("fold"),
     "fold_comparison": lambda: comparison("fold"),

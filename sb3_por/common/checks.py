@@ -26,14 +26,14 @@ def check_types(function: Callable[..., Any], values: Mapping[str, Any]) -> None
 
 def check_ranges(values: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]) -> None:
     """
-    :param values: Name of a parameter: its value. A tuple such as ``(1, "episode")`` stands for its first element; other
-        values that are not numbers are passed over
+    :param values: Name of a parameter: its value. A tuple such as ``(1, "episode")`` stands for its first element, a schedule
+        for its value at the start; other values that are not numbers are passed over
     :param ranges: Name of a parameter: its smallest and its largest value
     :raises ValueError: If a number is out of its range, or NaN
     """
     for name, (low, high) in ranges.items():
         value = values.get(name)
-        value = value[0] if isinstance(value, tuple) and value else value
+        value = value[0] if isinstance(value, tuple) and value else value(1.0) if callable(value) else value
         if isinstance(value, Real) and not low <= float(value) <= high:
             limit = f"between {low:g} and {high:g}" if high < sys.float_info.max else f"a finite number of at least {low:g}"
             raise ValueError(f"{name} must be {limit}, got {value!r}")

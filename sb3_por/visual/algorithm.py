@@ -139,8 +139,6 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         # Not those that SB3 has replaced by objects
         values = {name: value for name, value in vars(self).items() if name not in ("env", "policy", "device")}
         check_types(type(self), values)
-        if callable(self.learning_rate):
-            values["learning_rate"] = self.learning_rate(1.0)
         check_ranges(values, RANGES)
         check_precision(self.precision)
 

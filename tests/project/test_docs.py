@@ -5,6 +5,7 @@ import importlib.util
 import re
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -91,6 +92,7 @@ class Parsed(Exception):
 @pytest.fixture
 def check_train(monkeypatch, tmp_path):
     """Give arguments to train.py, up to the place where it would train or read the run to be resumed."""
+    from sb3_por.training import arguments as command_line
     from sb3_por.training import zoo
 
     def accept(*_, **__):
@@ -104,6 +106,9 @@ def check_train(monkeypatch, tmp_path):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(zoo, "Experiment", accept)
+    monkeypatch.setattr(
+        command_line, "th", SimpleNamespace(cuda=SimpleNamespace(is_available=lambda: True))
+    )  # a reader has it
     monkeypatch.setattr(zoo.Parser, "_resumed", accept)
     monkeypatch.setattr("sys.argv", [])
     return check

@@ -344,7 +344,7 @@ def test_failures_are_named_and_what_is_finished_is_not_done_again(suite_file, t
     path, root = suite_file(SMALL_SUITE), tmp_path / "runs"
     assert main(["suite", str(path), "--root", str(root)]) == 1
     shown = capfd.readouterr()
-    assert "failed: Pendulum-v1/td3/seed_0" in shown.err and "unexpected keyword argument 'colour'" in shown.err
+    assert "failed: Pendulum-v1/td3/seed_0" in shown.err and "unknown setting of td3 'colour'" in shown.err
     assert shown.out.strip() == str(root / "grid" / "scores.csv")
     scores = pd.read_csv(root / "grid" / "scores.csv")
     assert scores[["algo", "seed", "step"]].values.tolist() == [["sac", 0, 60]]

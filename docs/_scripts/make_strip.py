@@ -2,7 +2,7 @@
 Draw the README's strip: the first held-out scene of each of the five tasks, solved by scripted experts or by models.
 
     python docs/_scripts/make_strip.py
-    python docs/_scripts/make_strip.py --model PourWater-v0=logs/sac_por/PourWater-v0_1 --model FoldCloth-v0=fold.zip
+    python docs/_scripts/make_strip.py --model PourWater-v0=sb3_por/pretrained/plain-PourWater-v0.zip
 
 A caption names what plays, and its score.
 """

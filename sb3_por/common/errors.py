@@ -2,6 +2,7 @@
 
 import difflib
 import os
+import reprlib
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -81,6 +82,13 @@ def check_known(kind: str, name: str, known: Iterable[str]) -> None:
     else:
         hint = f"choose from {', '.join(names)}" if len(names) <= MAX_LISTED else "no name is near it"
     raise UserError(f"unknown {kind} {name!r}; {hint}")
+
+
+def short(value: Any) -> str:
+    """Any value from a file for a message: a few elements of what is nested, however large it is, and 80 characters of a text."""
+    shortened = reprlib.Repr()
+    shortened.maxstring = 80
+    return shortened.repr(value)
 
 
 def one_line(error: BaseException) -> str:

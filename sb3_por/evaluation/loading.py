@@ -1,7 +1,6 @@
 """Loading of any saved model for use: with its algorithm and its environment, without its replay buffer."""
 
 import importlib
-import reprlib
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_por.common import plain
-from sb3_por.common.errors import UserError, UserNote, check_known, one_line
+from sb3_por.common.errors import UserError, UserNote, check_known, one_line, short
 from sb3_por.evaluation import plain_files
 from sb3_por.evaluation.environment import make_wrapped, observation_kwargs
 from sb3_por.evaluation.episodes import Model, whole_episodes
@@ -142,7 +141,7 @@ def _load_safe(path: Path, env_id: str, environment: dict[str, Any], algo: str |
     try:
         n_frames = read_settings(path.parent / env_id.rpartition(":")[2] / HYPERPARAMETERS).get("frame_stack") or 1
         if not isinstance(n_frames, int) or not 1 <= n_frames <= MAX_FRAMES:
-            raise UserError(f"frame_stack is refused: {reprlib.repr(n_frames)} is no number from 1 to {MAX_FRAMES}")
+            raise UserError(f"frame_stack is refused: {short(n_frames)} is no number from 1 to {MAX_FRAMES}")
         return load_safe(path, VecFrameStack(env, n_frames) if n_frames > 1 else env, algo=algo)
     finally:
         env.close()
@@ -234,8 +233,6 @@ def find_environment(env_id: str, model: str | Path | None = None, safe: bool = 
     if not safe:
         import_packages(packages)
     elif packages and name not in gym.registry:
-        raise UserError(
-            f"safe loading does not import the packages of the run, {reprlib.repr(packages)}; --env PACKAGE:{name} does"
-        )
+        raise UserError(f"safe loading does not import the packages of the run, {short(packages)}; --env PACKAGE:{name} does")
     check_known("environment", name, gym.registry)
     return name

@@ -2,7 +2,6 @@
 
 import itertools
 import re
-import reprlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +21,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_por.common import plain
 from sb3_por.common.checks import check_types
-from sb3_por.common.errors import UserError, check_known, one_line
+from sb3_por.common.errors import UserError, check_known, one_line, short
 from sb3_por.evaluation.model_files import LOADABLE, candidates, model_file
 from sb3_por.evaluation.plain_files import lacks_values, read_json, read_tensors
 from sb3_por.runs.environment import TrainingEnvironment
@@ -110,7 +109,7 @@ def check_environment(made_of: TrainingEnvironment) -> None:
         for one in spec if isinstance(spec, list) else [spec] if spec else []:
             name, arguments = next(iter(one.items())) if isinstance(one, dict) and len(one) == 1 else (one, {})
             if name not in WRAPPERS:
-                raise UserError(f"the wrapper {reprlib.repr(name)} is refused; safe loading knows {', '.join(WRAPPERS)}")
+                raise UserError(f"the wrapper {short(name)} is refused; safe loading knows {', '.join(WRAPPERS)}")
             _check_values(f"arguments of {name}", arguments or {}, texts=False)
     _check_values("env_kwargs", made_of.env_kwargs or {}, texts=task_class(made_of.env_id) is not None)
 
@@ -283,7 +282,7 @@ def _check_values(what: str, value: Any, texts: bool = True) -> None:
         elif isinstance(part, (list, tuple)):
             left += [(where, one) for one in part]
         elif isinstance(part, ClassName) or not isinstance(part, (bool, int, float, str, type(None))):
-            raise UserError(f"{where} is refused: {reprlib.repr(part)} is no plain value")
+            raise UserError(f"{where} is refused: {short(part)} is no plain value")
         elif isinstance(part, str) and not texts:
-            raise UserError(f"{where} is refused: what the text {reprlib.repr(part)} does there is not known")
+            raise UserError(f"{where} is refused: what the text {short(part)} does there is not known")
     raise UserError(f"{what} is refused: more than {MAX_VALUES} values")

@@ -1,7 +1,6 @@
 """Parts of a run's training environment, as its settings name them, and their import."""
 
 import ast
-import reprlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -11,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_por.common.errors import UserError, one_line
+from sb3_por.common.errors import UserError, one_line, short
 from sb3_por.runs.folder import dump_settings, import_names, parse_settings
 from sb3_por.visual.made_of import made_of
 
@@ -131,9 +130,7 @@ def read_normalization(value: Any) -> bool | dict[str, Any]:
         return bool(parsed)
     if isinstance(parsed, dict) and all(isinstance(key, str) for key in parsed):
         return parsed or True
-    raise UserError(
-        f"normalize must be True, False or arguments of VecNormalize, {{'norm_obs': False}}, got {reprlib.repr(value)}"
-    )
+    raise UserError(f"normalize must be True, False or arguments of VecNormalize, {{'norm_obs': False}}, got {short(value)}")
 
 
 class _DictCalls(ast.NodeTransformer):

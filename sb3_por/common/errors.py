@@ -85,7 +85,7 @@ def check_known(kind: str, name: str, known: Iterable[str]) -> None:
 
 
 def short(value: Any) -> str:
-    """Any value from a file for a message: a few elements of what is nested, however large it is, and 80 characters of a text."""
+    """Any value from a file for a message: a few elements of what is nested, however large, and 80 characters of a text."""
     shortened = reprlib.Repr()
     shortened.maxstring = 80
     return shortened.repr(value)

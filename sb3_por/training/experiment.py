@@ -311,7 +311,15 @@ class Experiment(ExperimentManager):
             model.env.close()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
-        """Write files atomically, and say how an interrupted run is resumed."""
+        """Write files atomically, say how an interrupted run is resumed, and let go of the folder."""
+        try:
+            self._finish(model)
+        finally:
+            # Not when this object is collected: a lock file without the system's help would stay until then
+            self._lock.release()
+
+    def _finish(self, model: BaseAlgorithm) -> None:
+        """See ``save_trained_model``."""
         message = f"interrupted at step {model.num_timesteps}; resume with: python train.py --resume {self.save_path}"
         if self._interrupted and latest_checkpoint(Path(self.save_path)) is None:
             # A model without a checkpoint is what marks a finished run.

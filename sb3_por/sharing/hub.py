@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from sb3_por.common.errors import UserError, one_line
+from sb3_por.common.errors import UserError, UserNote, one_line
 from sb3_por.common.files import check_writable
 from sb3_por.evaluation.environment import make_evaluation_env
 from sb3_por.evaluation.loading import find_environment, resolve
@@ -131,15 +132,23 @@ def _the_model(repo: str, names: set[str]) -> str:
 
 
 def _take_evaluations(archive: Path, run: Path) -> None:
-    """Take the evaluations, which ``plot`` draws, from the card's archive; within a bound, and under the name used here."""
+    """
+    Take the evaluations, which ``plot`` draws, from the card's archive; within a bound, and under the name used here. A
+    damaged archive costs them alone, and a note.
+    """
     if not archive.is_file():
         return
     try:
         with zipfile.ZipFile(archive) as metrics:
             if files.EVALUATIONS in metrics.namelist() and metrics.getinfo(files.EVALUATIONS).file_size <= MAX_FILE:
-                (run / files.EVALUATIONS).write_bytes(metrics.read(files.EVALUATIONS))
-    except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, EOFError):
+                evaluations = metrics.read(files.EVALUATIONS)
+            else:
+                return
+    # Whatever a damaged archive makes zipfile raise
+    except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, EOFError) as error:
+        warnings.warn(f"cannot read {archive.name}, so there are no evaluations to plot: {one_line(error)}", UserNote)
         return
+    (run / files.EVALUATIONS).write_bytes(evaluations)
 
 
 def _settings(path: Path) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from hub_stand_in import Hub
 from stable_baselines3 import SAC
 
 from sb3_por.__main__ import main
-from sb3_por.common.errors import UserError
+from sb3_por.common.errors import UserError, UserNote
 from sb3_por.evaluation import evaluate
 from sb3_por.runs.folder import read_settings
-from sb3_por.sharing.hub import MAX_FILE, pull, push
+from sb3_por.sharing.hub import MAX_FILE, _take_evaluations, pull, push
 from sb3_por.training.zoo import main as train
 
 NAME = "sac-Pendulum-v1"
@@ -209,3 +209,14 @@ def test_what_cannot_be_shared_is_one_line(arguments, message, hub, run, tmp_pat
 class Huge(bytes):
     def __len__(self):
         return MAX_FILE + 1
+
+
+def test_a_damaged_archive_of_evaluations_is_noted_and_costs_them_alone(tmp_path):
+    archive = tmp_path / "train_eval_metrics.zip"
+    archive.write_bytes(b"PK no archive")
+    with pytest.warns(UserNote, match="cannot read train_eval_metrics.zip, so there are no evaluations to plot"):
+        _take_evaluations(archive, tmp_path)
+    with zipfile.ZipFile(archive, "w") as metrics:
+        metrics.writestr("evaluations.npz", b"scores")
+    _take_evaluations(archive, tmp_path)
+    assert (tmp_path / "evaluations.npz").read_bytes() == b"scores"

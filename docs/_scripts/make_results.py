@@ -302,7 +302,8 @@ def scores_of(algo: str) -> str:
 def metrics_of(objective: str) -> str:
     """Repeat an objective's rows of the page of metrics."""
     page = (DOCS / "metrics.md").read_text()
-    rows = re.findall(rf"^\| `train/(?:{objective}_|encoder_grad_norm_{objective}`).*$", page, re.MULTILINE)
+    own = f"{objective}_|encoder_grad_norm_{objective}`|encoder_grad_cosine`"
+    rows = re.findall(rf"^\| `train/(?:{own}).*$", page, re.MULTILINE)
     return "\n".join(["| metric | meaning | usual | worry if |", "| --- | --- | --- | --- |", *rows])
 
 

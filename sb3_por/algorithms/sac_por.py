@@ -49,7 +49,8 @@ class SACPOR(VisualSAC):
     :param seed: Seed of the random generators
     :param device: PyTorch device
     :param _init_setup_model: Whether to build the networks at the creation of the instance
-    :param por_coef: Weight lambda of the POR loss
+    :param por_coef: Weight lambda of the POR loss; ``"auto_0.1"`` for the weight with which its gradient with respect to the
+        encoder is a tenth of the critic's
     :param pairing: ``"paper"``, or ``"swap"``, which keeps the classifier from telling the two encoders apart
     :param order_head: The classifier c: ``"mlp"`` (the paper's), ``"difference"`` or ``"coordinatewise"``
     :param order_dim: Size m of the physical quantities; half the encoder's features by default
@@ -113,7 +114,7 @@ class SACPOR(VisualSAC):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
         *,
-        por_coef: float = 0.1,
+        por_coef: str | float = 0.1,
         pairing: str = "swap",
         order_head: str = "mlp",
         order_dim: int | None = None,
@@ -188,5 +189,5 @@ class SACPOR(VisualSAC):
         )
 
     @property
-    def objective_coef(self) -> float:
+    def objective_coef(self) -> str | float:
         return self.por_coef

@@ -20,7 +20,10 @@ CLASSIFIER_METRICS = ["por_loss", "por_accuracy", "por_leak_loss", "por_leak_acc
 #: Gradient norms with respect to the encoder: of the critic's loss, and of the weighted POR loss.
 GRADIENT_METRICS = ["encoder_grad_norm_critic", "encoder_grad_norm_por"]
 ORDER_METRICS = [*CLASSIFIER_METRICS, *GRADIENT_METRICS]
-ORDER_COLUMNS = [*RUN_KEYS, "step", *ORDER_METRICS]
+#: The weight lambda, and the cosine of the two gradients; in tables, not in figures.
+BALANCE_METRICS = ["por_coef", "encoder_grad_cosine"]
+LOGGED_METRICS = [*ORDER_METRICS, *BALANCE_METRICS]
+ORDER_COLUMNS = [*RUN_KEYS, "step", *LOGGED_METRICS]
 #: How TensorBoard names its files.
 EVENT_FILES = "events.out.tfevents.*"
 
@@ -60,14 +63,14 @@ def read_order_of(run: Path) -> pd.DataFrame:
     :return: its rows; none if it has logged no POR loss
     :raises NoLogs: if it has no TensorBoard files
     """
-    events: dict[str, list[tuple[float, int, float]]] = {metric: [] for metric in ORDER_METRICS}
+    events: dict[str, list[tuple[float, int, float]]] = {metric: [] for metric in LOGGED_METRICS}
     for log in _logs_of(run):
-        for metric in set(ORDER_METRICS) & {tag.removeprefix("train/") for tag in log.Tags()["scalars"]}:
+        for metric in set(LOGGED_METRICS) & {tag.removeprefix("train/") for tag in log.Tags()["scalars"]}:
             events[metric] += [(event.wall_time, event.step, event.value) for event in log.Scalars(f"train/{metric}")]
     if not events["por_loss"]:
-        events = {metric: [] for metric in ORDER_METRICS}  # other objectives log gradient norms, too
+        events = {metric: [] for metric in LOGGED_METRICS}  # other objectives log gradient norms, too
     columns = {metric: _latest(logged) for metric, logged in events.items()}
-    table = pd.DataFrame(columns, columns=ORDER_METRICS, dtype=float).rename_axis("step").reset_index()
+    table = pd.DataFrame(columns, columns=LOGGED_METRICS, dtype=float).rename_axis("step").reset_index()
     for key, value in run_identity(run).items():
         table[key] = value
     return table[ORDER_COLUMNS]

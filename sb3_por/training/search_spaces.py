@@ -7,6 +7,9 @@ import optuna
 
 from sb3_por.objectives.por import ORDER_HEADS, PAIRINGS
 
+#: Weights of POR that are tried
+POR_COEFS: tuple[str | float, ...] = ("auto_0.03", "auto_0.1", "auto_0.3", "auto_1.0", 0.1, 1.0, 10.0, 100.0, 1000.0)
+
 Space = Callable[[optuna.Trial], dict[str, Any]]
 
 
@@ -27,8 +30,9 @@ def partial_order(trial: optuna.Trial) -> dict[str, Any]:
     :return: lambda, m (of 50 features), k, pairing and head of the partial-order objective
     """
     return {
-        # Beside the critic's loss, which grows with the square of what a step can earn: 400 times in our settings
-        "por_coef": trial.suggest_float("por_coef", 0.1, 1000.0, log=True),
+        # Ratios of gradients, and fixed weights beside the critic's loss, which grows with the square of what a step can earn:
+        # 400 times in our settings
+        "por_coef": trial.suggest_categorical("por_coef", POR_COEFS),
         "order_dim": trial.suggest_categorical("order_dim", [1, 5, 10, 25, 40]),
         "k": trial.suggest_int("k", 1, 5),
         "random_k": trial.suggest_categorical("random_k", [False, True]),

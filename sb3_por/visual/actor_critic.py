@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from sb3_por.common.errors import UserError
 from sb3_por.visual.algorithm import VisualAlgorithm
+from sb3_por.visual.balance import INTERVAL, EncoderGradients
 from sb3_por.visual.batch import Frames, demonstrated, encode, interleave, repeat, take
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 
@@ -20,7 +21,7 @@ class Losses(NamedTuple):
     The losses of one batch that train the encoder, and what the actor's update uses again.
 
     :param critic: L_RL, a scalar
-    :param objective: lambda * L_objective, a scalar; 0 without an objective
+    :param objective: L_objective, a scalar, without its weight lambda; 0 without an objective
     :param metrics: Detached scalars of the objective, to log
     :param present: First augmentation of o_t, preprocessed
     :param trunk_t: The critic's trunk features of it, detached, shape ``(batch, trunk_dim)``
@@ -41,13 +42,6 @@ class VisualActorCritic(VisualAlgorithm, ABC):
 
     A subclass defines how its critic measures values: ``_next_values``, ``_critic_loss`` and ``_actor_values``.
     """
-
-    @property
-    def objective_coef(self) -> float:
-        """
-        :return: Weight lambda of the objective's loss
-        """
-        return 1.0
 
     # -- defined by a subclass ------------------------------------------------------------------------------------
 
@@ -118,7 +112,11 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         self._metrics.add("ent_coef", self.temperature)
         self._metrics.add("critic_loss", losses.critic)
         if self.policy.objective is not None:
+            if self._balance.ratio is not None and (self._n_updates - 1) % INTERVAL == 0:
+                self._balance.measure(self.encoder_gradients(losses))
             self._log_objective(losses.metrics)
+            if self.policy.objective_optimizer is None:
+                self._log_objective({"coef": th.as_tensor(self.objective_weight)})
             if self._n_updates % self.diagnostics_interval == 0:
                 self._log_diagnostics(batch, losses)
 
@@ -132,7 +130,7 @@ class VisualActorCritic(VisualAlgorithm, ABC):
     def losses(self, batch: Any) -> Losses:
         """
         :param batch: Samples of the replay buffer
-        :return: L_RL and lambda * L_objective
+        :return: L_RL and L_objective
         """
         objective, batch_size = self.policy.objective, len(batch.actions)
         # Every frame is augmented independently. M augmentations of o_t and K of o_{t+1} are rows of one batch (DrQ)
@@ -144,12 +142,11 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         with th.no_grad():
             s_next = self.critic_target.features(frames.next)
 
-        # lambda * L_objective
+        # L_objective
         objective_loss, metrics = s_t.new_zeros(()), {}
         if objective is not None:
             encoded = encode(frames, batch, objective, s_t[:batch_size], s_next[:batch_size], self.policy)
-            loss, metrics = objective.loss(encoded)
-            objective_loss = self.objective_coef * loss
+            objective_loss, metrics = objective.loss(encoded)
 
         # L_RL: the target is the mean over the K augmentations, the loss that over the M
         with th.no_grad():
@@ -164,14 +161,15 @@ class VisualActorCritic(VisualAlgorithm, ABC):
     def _step_encoder(self, losses: Losses) -> None:
         """One step of critic, encoder and objective on the sum of the losses, or one step for each loss."""
         own_optimizer = self.policy.objective_optimizer
+        weighted = self.objective_weight * losses.objective
         self.critic.optimizer.zero_grad()
         if own_optimizer is None:
-            (losses.critic + losses.objective).backward()
+            (losses.critic + weighted).backward()
             self.critic.optimizer.step()
             return
         parameters = [parameter for group in own_optimizer.param_groups for parameter in group["params"]]
         # Before the critic's step changes what this gradient was computed with
-        gradients = th.autograd.grad(losses.objective, parameters, retain_graph=True, allow_unused=True)
+        gradients = th.autograd.grad(weighted, parameters, retain_graph=True, allow_unused=True)
         losses.critic.backward()
         self.critic.optimizer.step()
         for parameter, gradient in zip(parameters, gradients, strict=True):
@@ -304,18 +302,41 @@ class VisualActorCritic(VisualAlgorithm, ABC):
             encoded = encode(frames, batch, self.policy.objective, s_t, s_next, self.policy)
             return self.policy.objective.control(encoded)
 
+    @property
+    def objective_weight(self) -> float | th.Tensor:
+        """
+        :return: Weight lambda of the objective's loss as it is now: ``objective_coef``, or what balances the gradients
+        """
+        coef = self.objective_coef
+        return self._balance.weight if isinstance(coef, str) else coef
+
+    def encoder_gradients(self, losses: Losses) -> EncoderGradients:
+        """
+        :param losses: Losses of one batch; their graph is kept
+        :return: Gradient of each loss with respect to the encoder
+        """
+        parameters = self.critic.encoder_parameters()
+
+        def gradient(loss: th.Tensor) -> th.Tensor:
+            parts = th.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
+            return th.cat(
+                [(th.zeros_like(p) if part is None else part).flatten() for p, part in zip(parameters, parts, strict=True)]
+            )
+
+        return EncoderGradients(gradient(losses.critic), gradient(losses.objective))
+
     def encoder_grad_norms(self, losses: Losses) -> dict[str, th.Tensor]:
         """
         :param losses: Losses of one batch; their graph is kept
-        :return: Norm of the gradient of each loss with respect to the encoder, by the name of the loss
+        :return: Norm of the gradients of L_RL and of lambda * L_objective with respect to the encoder, by the name of the loss
         """
-        parameters = self.critic.encoder_parameters()
-        norms = {}
-        for name, loss in (("critic", losses.critic), (self.policy.objective.name, losses.objective)):
-            gradients = th.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
-            parts = [gradient.norm() for gradient in gradients if gradient is not None]
-            norms[name] = th.stack(parts).norm() if parts else loss.new_zeros(())
-        return norms
+        return self._norms(self.encoder_gradients(losses))
+
+    def _norms(self, gradients: EncoderGradients) -> dict[str, th.Tensor]:
+        return {
+            "critic": gradients.critic.norm(),
+            self.policy.objective.name: self.objective_weight * gradients.objective.norm(),
+        }
 
     # -- logging --------------------------------------------------------------------------------------------------
 
@@ -324,9 +345,11 @@ class VisualActorCritic(VisualAlgorithm, ABC):
             self._metrics.add(f"{self.policy.objective.name}_{name}", value)
 
     def _log_diagnostics(self, batch: Any, losses: Losses) -> None:
-        """Log the gradient norm of each loss with respect to the encoder, and the objective's control."""
-        for name, norm in self.encoder_grad_norms(losses).items():
+        """Log norms and cosine of the gradients of the losses with respect to the encoder, and the objective's control."""
+        gradients = self.encoder_gradients(losses)
+        for name, norm in self._norms(gradients).items():
             self._metrics.add(f"encoder_grad_norm_{name}", norm)
+        self._metrics.add("encoder_grad_cosine", gradients.cosine())
         self._log_objective(self.control_metrics(batch))
 
     def _record_metrics(self) -> None:

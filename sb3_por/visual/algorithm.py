@@ -27,6 +27,7 @@ from sb3_por.common.running_means import RunningMeans
 from sb3_por.demonstrations.dataset import Demonstrations, describe
 from sb3_por.demonstrations.playback import fill, n_transitions
 from sb3_por.objectives.base import Objective
+from sb3_por.visual.balance import GradientBalance, gradient_ratio
 from sb3_por.visual.batch import Augmentation
 from sb3_por.visual.made_of import made_of
 from sb3_por.visual.normalization import transpose_inside
@@ -127,6 +128,7 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         self.policy.is_trained_here = True
         self._acceleration = AcceleratedUpdates(self.policy, self.precision, self.compile_mode)
         self._augmentation = Augmentation(self.policy, self.augmentation_pad)
+        self._balance = GradientBalance(self._gradient_ratio(), self.device)
         self._metrics = RunningMeans()
         # In the .zip, from which a stranger rebuilds the model without pickled code
         setattr(self, plain.ATTRIBUTE, plain.describe(self))
@@ -141,6 +143,31 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         check_types(type(self), values)
         check_ranges(values, RANGES)
         check_precision(self.precision)
+        self._gradient_ratio()
+
+    @property
+    def objective_coef(self) -> str | float:
+        """
+        :return: Weight lambda of the objective's loss, or the ratio of gradients that it keeps, such as ``"auto_0.1"``
+        """
+        return 1.0
+
+    def _gradient_ratio(self) -> float | None:
+        """
+        :return: The ratio that ``objective_coef`` names; None if it is a number
+        :raises ValueError: If it is neither, or if there is nothing to balance
+        """
+        objective = self.objective_class
+        named = (
+            "objective_coef" if objective is None or not hasattr(self, f"{objective.name}_coef") else f"{objective.name}_coef"
+        )
+        ratio = gradient_ratio(self.objective_coef, named)
+        if ratio is not None and objective is not None and objective.own_optimizer:
+            raise ValueError(
+                f"{named} cannot balance gradients: {objective.__name__} has an optimizer of its own, whose steps do not "
+                "depend on the weight of the loss; use aux_lr_ratio"
+            )
+        return ratio
 
     def _check_class(self) -> None:
         """
@@ -302,4 +329,8 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
             raise ValueError("the state of the objective's optimizer is missing in the one of critic.optimizer")
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_augmentation", "_acceleration", "demo_buffer"]
+        return [*super()._excluded_save_params(), "_metrics", "_augmentation", "_acceleration", "_balance", "demo_buffer"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        return state_dicts, [*variables, "_balance.norms"] if self._balance.ratio is not None else variables

@@ -119,7 +119,8 @@ def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
     order, left_out = read_order([tmp_path])
     assert left_out == [] and set(order["algo"]) == {"sac_por"} and order["step"].tolist() == [100, 200, 300] * 2
     assert order["por_loss"].to_numpy() == pytest.approx([0.7, 0.6, 0.5, 0.7, 0.4, 0.1])
-    assert order["por_leak_loss"].isna().all()
+    assert order["por_leak_loss"].isna().all() and order["encoder_grad_cosine"].isna().all()
+    assert order["por_coef"].to_numpy() == pytest.approx(2 * order["por_loss"].to_numpy())
     write_order(order, tmp_path / "order.csv")
     pd.testing.assert_frame_equal(read_order([tmp_path / "order.csv"])[0], order)
     one, notes = plot_order(order)

@@ -60,7 +60,13 @@ def test_ranges(value, fits):
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        (dict(por_coef="x"), "por_coef must be float"),
+        (dict(por_coef=[1]), "por_coef must be str | float"),
+        (dict(por_coef="x"), "por_coef must be a number, 'auto', or a ratio of gradients above 0 such as 'auto_0.1', got 'x'"),
+        (dict(por_coef="auto_"), "por_coef must be a number"),
+        (dict(por_coef="auto_x"), "por_coef must be a number"),
+        (dict(por_coef="auto_0"), "por_coef must be a number"),
+        (dict(por_coef="auto_nan"), "por_coef must be a number"),
+        (dict(por_coef="automatic_1"), "por_coef must be a number"),
         (dict(learning_rate="fast"), "learning_rate must be float"),
         (dict(batch_size=8.5), "batch_size must be int"),
         (dict(pairing=3), "pairing must be str"),

@@ -50,6 +50,7 @@ def log_order(folder, losses, first_step=100, returns=()):
             writer.add_scalar("train/por_accuracy", 1 - loss, first_step + 100 * i)
             writer.add_scalar("train/encoder_grad_norm_critic", 10.0, first_step + 100 * i)
             writer.add_scalar("train/encoder_grad_norm_por", loss, first_step + 100 * i)
+            writer.add_scalar("train/por_coef", 2 * loss, first_step + 100 * i)
 
 
 def table(algo, env, seed, performance, steps=STEPS):

@@ -77,11 +77,12 @@ def assert_same_buffer(buffer, other):
     [
         (SACPOR, dict()),
         (SACPOR, dict(k=3, random_k=True, order_head="difference", diagnostics_interval=7)),
+        (SACPOR, dict(por_coef="auto_0.3")),
         (SACCURL, dict(aux_lr_ratio=0.5)),
         (VisualSAC, dict(use_sde=True)),
         (VisualSAC, dict(ent_coef=0.1, n_steps=3)),
     ],
-    ids=["por", "por-k3", "curl", "sde", "fixed-temperature"],
+    ids=["por", "por-k3", "por-balanced", "curl", "sde", "fixed-temperature"],
 )
 def test_300_steps_save_load_300_more_equals_600_in_one_go(cls, kwargs, tmp_path):
     in_one_go = make_model(cls, make_env(), **kwargs).learn(600)

@@ -23,9 +23,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import SACPOR
-from sb3_por.objectives.por import PAIRINGS
 
 ENVS = ("iid", "SwingingBall-v0", "FallingBall-v0", "PourWater-v0")
+PAIRINGS = ("paper", "swap")
 METRICS = ("por_loss", "por_accuracy", "por_leak_loss", "por_leak_accuracy")
 COLUMNS = ("env", "pairing", "seed", "update", *METRICS)
 #: Updates between two rows of the table; each is a mean over them.

@@ -5,6 +5,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from softbody_envs.env import STATE_LIMIT
+
 
 class ActionRepeat(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.RecordConstructorArgs):
     """
@@ -81,3 +83,121 @@ class ProgressReward(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Re
         change = info["normalized_performance"] - self._performance
         self._performance = info["normalized_performance"]
         return observation, self.scale * change, terminated, truncated, info
+
+
+class ShowQuantity(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.RecordConstructorArgs):
+    """
+    Add the true quantity to the image: ``{"image": ..., "quantity": ...}``, the input of an encoder that represents the
+    quantity perfectly. What a policy gains from it bounds what a loss that teaches this quantity can add.
+
+    :param env: Environment that observes images and reports the quantity in ``info`` at resets and steps
+    :param key: Name of the quantity in ``info``: ``"monotone"`` is what POR would learn, ``"normalized_performance"`` the
+        score
+    :raises ValueError: If ``env`` does not observe images
+    """
+
+    def __init__(self, env: gym.Env[Any, np.ndarray], key: str = "monotone"):
+        gym.utils.RecordConstructorArgs.__init__(self, key=key)
+        gym.Wrapper.__init__(self, env)
+        image = env.observation_space
+        if not isinstance(image, gym.spaces.Box) or len(image.shape) != 3:
+            raise ValueError(f"ShowQuantity needs an environment that observes images, got {image}")
+        self.key = key
+        quantity = gym.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (1,), np.float32)
+        self.observation_space = gym.spaces.Dict({"image": image, "quantity": quantity})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See ``gymnasium.Env.reset``."""
+        image, info = self.env.reset(seed=seed, options=options)
+        return self._with_quantity(image, info), info
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See ``gymnasium.Env.step``."""
+        image, reward, terminated, truncated, info = self.env.step(action)
+        return self._with_quantity(image, info), float(reward), terminated, truncated, info
+
+    def _with_quantity(self, image: Any, info: dict[str, Any]) -> dict[str, Any]:
+        quantity = np.clip([info[self.key]], -STATE_LIMIT, STATE_LIMIT).astype(np.float32)
+        return {"image": image, "quantity": quantity}
+
+
+class SuccessReward(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.RecordConstructorArgs):
+    """
+    Reward success alone: a sparse reward, ``scale`` at each step at which ``info["is_success"]`` holds, else 0.
+
+    :param env: Environment that reports ``info["is_success"]``
+    :param scale: Reward of a step, above 0
+    :raises ValueError: If ``scale`` is not above 0
+    """
+
+    def __init__(self, env: gym.Env[Any, np.ndarray], scale: float = 1.0):
+        gym.utils.RecordConstructorArgs.__init__(self, scale=scale)
+        gym.Wrapper.__init__(self, env)
+        if not scale > 0.0:
+            raise ValueError(f"scale must be above 0, got {scale!r}")
+        self.scale = scale
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See ``gymnasium.Env.step``."""
+        observation, _, terminated, truncated, info = self.env.step(action)
+        return observation, self.scale * float(info["is_success"]), terminated, truncated, info
+
+
+class Distraction(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.RecordConstructorArgs):
+    """
+    Blend each image with a coarse texture that moves whatever the agent does, and let the camera shake. The texture and its
+    motion follow from the scene (``info["variation"]``), so that held-out episodes look the same in every evaluation.
+
+    :param env: Environment that observes images and reports ``info["variation"]`` at resets
+    :param motion: ``"swing"``, to and fro: reversible in time, so that the order of two frames cannot be told from it; or
+        ``"drift"``, steadily to the right: an arrow of time that has nothing to do with the task
+    :param strength: Weight of the texture, from 0 to 1
+    :param jitter: Largest random shift of the picture in each direction, pixels
+    :raises ValueError: If an argument is out of range, or ``env`` does not observe images
+    """
+
+    #: Steps of a swing to and fro
+    period = 8
+    #: Pixels of a texture's element, and of its motion in a step
+    element, speed = 8, 3
+
+    def __init__(self, env: gym.Env[Any, np.ndarray], motion: str, strength: float = 0.4, jitter: int = 0):
+        gym.utils.RecordConstructorArgs.__init__(self, motion=motion, strength=strength, jitter=jitter)
+        gym.Wrapper.__init__(self, env)
+        space = env.observation_space
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 3:
+            raise ValueError(f"Distraction needs an environment that observes images, got {space}")
+        if motion not in ("swing", "drift"):
+            raise ValueError(f"motion must be 'swing' or 'drift', got {motion!r}")
+        if not 0.0 <= strength <= 1.0 or jitter < 0:
+            raise ValueError(f"strength must be from 0 to 1 and jitter at least 0, got {strength!r} and {jitter!r}")
+        self.motion, self.strength, self.jitter = motion, strength, int(jitter)
+        self._size = space.shape[0]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See ``gymnasium.Env.reset``."""
+        image, info = self.env.reset(seed=seed, options=options)
+        self._rng = np.random.default_rng(info["variation"])
+        n = -(-self._size // self.element)
+        coarse = self._rng.integers(0, 256, (n, n, 3), dtype=np.uint8)
+        self._texture = coarse.repeat(self.element, axis=0).repeat(self.element, axis=1)[: self._size, : self._size]
+        self._start, self._steps = self._rng.uniform(), 0
+        return self._distract(image), info
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See ``gymnasium.Env.step``."""
+        image, reward, terminated, truncated, info = self.env.step(action)
+        self._steps += 1
+        return self._distract(image), float(reward), terminated, truncated, info
+
+    def _distract(self, image: np.ndarray) -> np.ndarray:
+        """Blend the image with the texture at its place in this step, and shift the result at random."""
+        if self.motion == "drift":
+            place = self._start * self._size + self.speed * self._steps
+        else:
+            place = 2 * self.speed * np.sin(2 * np.pi * (self._start + self._steps / self.period))
+        texture = np.roll(self._texture, round(place), axis=1)
+        blended = np.rint((1 - self.strength) * image + self.strength * texture).astype(np.uint8)
+        y, x = self._rng.integers(0, 2 * self.jitter + 1, 2)
+        padded = np.pad(blended, ((self.jitter,) * 2, (self.jitter,) * 2, (0, 0)), mode="edge")
+        return padded[y : y + self._size, x : x + self._size].copy()

@@ -51,7 +51,8 @@ class SACPOR(VisualSAC):
     :param _init_setup_model: Whether to build the networks at the creation of the instance
     :param por_coef: Weight lambda of the POR loss; ``"auto_0.1"`` for the weight with which its gradient with respect to the
         encoder is a tenth of the critic's
-    :param pairing: ``"paper"``, or ``"swap"``, which keeps the classifier from telling the two encoders apart
+    :param pairing: ``"paper"``, or ``"swap"``, which keeps the classifier from telling the two encoders apart; ``"sham"``, a
+        control, draws the order of swapped pairs by chance
     :param order_head: The classifier c: ``"mlp"`` (the paper's), ``"difference"`` or ``"coordinatewise"``
     :param order_dim: Size m of the physical quantities; half the encoder's features by default
     :param order_hidden_dim: Size of the hidden layers of g and c

@@ -38,7 +38,8 @@ _ENCODERS = (encoders.ConvEncoder, encoders.VectorEncoder, encoders.CombinedEnco
 CLASSES = {plain.class_path(cls): cls for cls in (*_ACTIVATIONS, *_EXTRACTORS, *_ENCODERS, nn.Identity)}
 #: Wrappers that a model may have been trained inside: they touch no file and call no function that they are given
 WRAPPERS = (
-    *(f"softbody_envs.wrappers.{name}" for name in ("ActionRepeat", "ProgressReward")),
+    *(f"softbody_envs.wrappers.{name}" for name in ("ActionRepeat", "Distraction")),
+    *(f"softbody_envs.wrappers.{name}" for name in ("ProgressReward", "ShowQuantity", "SuccessReward")),
     *(f"gymnasium.wrappers.{name}" for name in ("ClipAction", "ClipReward", "RescaleAction", "RescaleObservation")),
     *(f"gymnasium.wrappers.{name}" for name in ("FlattenObservation", "GrayscaleObservation", "ResizeObservation")),
     *(f"gymnasium.wrappers.{name}" for name in ("FrameStackObservation", "MaxAndSkipObservation", "TimeAwareObservation")),

@@ -6,7 +6,7 @@ from torch.nn import functional as F
 from sb3_por.objectives.base import EncodedBatch, Objective, mlp
 from sb3_por.objectives.order_heads import ORDER_HEADS
 
-PAIRINGS = ("paper", "swap")
+PAIRINGS = ("paper", "swap", "sham")
 
 
 class PartialOrder(Objective):
@@ -21,9 +21,12 @@ class PartialOrder(Objective):
     batch is i.i.d., so a fixed half is a random half. In that half o_t is paired with o_{t-k}, which spares the online encoder
     a second pass; the first frame of an episode has no earlier one and stays paired with o_{t+k}.
 
+    ``pairing="sham"`` is a control: swapped pairs whose order is drawn by chance, anew in each batch. There is nothing to
+    learn, so an effect on the agent is one of the loss itself.
+
     :param features_dim: Size n of the encoder's features
     :param action_dim: Size of an action
-    :param pairing: ``"paper"`` or ``"swap"``
+    :param pairing: ``"paper"``, ``"swap"`` or ``"sham"``
     :param order_head: The classifier c: ``"mlp"`` (the paper's), ``"difference"`` or ``"coordinatewise"``
     :param order_dim: Size m < n of the physical quantities x; n // 2 by default
     :param order_hidden_dim: Size of the hidden layers of g and c
@@ -58,7 +61,7 @@ class PartialOrder(Objective):
             raise ValueError(f"k must be at least 1, not {k}.")
         self.pairing = pairing
         self.future = (1 if random_k else k, k)
-        self.past = self.future if pairing == "swap" else None
+        self.past = None if pairing == "paper" else self.future
         self.g = mlp(features_dim, order_hidden_dim, order_dim)
         self.c = ORDER_HEADS[order_head](order_dim, order_hidden_dim)
 
@@ -89,6 +92,9 @@ class PartialOrder(Objective):
         half = len(past)
         s_t = th.cat([th.where(has_past, past, present[:half]), present[half:]])
         s_tk = th.cat([th.where(has_past, present[:half], future[:half]), future[half:]])
+        if self.pairing == "sham":
+            flipped = th.rand(len(s_t), 1, device=s_t.device) < 0.5
+            s_t, s_tk = th.where(flipped, s_tk, s_t), th.where(flipped, s_t, s_tk)
         return s_t, s_tk
 
     def control(self, batch: EncodedBatch) -> dict[str, th.Tensor]:

@@ -106,6 +106,21 @@ def test_swap_pairing_has_the_present_second_in_half_of_the_batch_but_not_at_the
     assert th.equal(s_tk, th.cat([present[:2], future[2:3], present[3:4], future[4:]]))
 
 
+def test_sham_pairs_are_those_of_swap_in_an_order_drawn_by_chance():
+    early, late = column([0.0] * 2000), column([1.0] * 2000)
+    batch = EncodedBatch(early, future=late, past=early[:1000], has_past=column([False] * 1000))
+    objective = PartialOrder(FEATURES_DIM, 1, pairing="sham")
+    objective.g, objective.c = nn.Identity(), FixedLogits()
+    th.manual_seed(0)
+    s_t, s_tk = objective.pairs(batch)
+    assert th.equal(s_t + s_tk, early + late)
+    assert s_t.mean().item() == pytest.approx(0.5, abs=0.05)
+    assert not th.equal(s_t, objective.pairs(batch)[0])
+    assert objective.loss(batch)[1]["accuracy"].item() == pytest.approx(0.5, abs=0.05)
+    objective.pairing = "swap"
+    assert objective.loss(batch)[1]["accuracy"].item() == 1.0
+
+
 @pytest.mark.parametrize("order_head", ["mlp", "difference", "coordinatewise"])
 def test_learns_an_order_and_a_potential_that_follows_it(order_head):
     th.manual_seed(0)

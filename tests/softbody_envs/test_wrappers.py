@@ -1,5 +1,7 @@
 """What settings may wrap around a task."""
 
+import itertools
+
 import gymnasium as gym
 import imageio.v3 as iio
 import numpy as np
@@ -8,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from softbody_envs.experts import make_expert
-from softbody_envs.wrappers import ActionRepeat, ProgressReward
+from softbody_envs.wrappers import ActionRepeat, Distraction, ProgressReward, ShowQuantity, SuccessReward
 
 ID = "PourWater-v0"
 
@@ -73,6 +75,81 @@ def test_the_sum_of_the_progress_is_the_final_performance(wrap):
         rewards.append(reward)
     assert sum(rewards) == pytest.approx(10.0 * info["normalized_performance"])
     assert abs(info["normalized_performance"]) > 0.1
+
+
+@pytest.mark.filterwarnings("ignore:.*is different from the unwrapped")
+@pytest.mark.parametrize("key", ["monotone", "normalized_performance"])
+def test_the_true_quantity_stands_beside_the_image(key):
+    env = ShowQuantity(ActionRepeat(gym.make("FallingBall-v0", image_size=40), repeat=4), key=key)
+    check_env(env, skip_render_check=True)
+    again = gym.make(env.spec)
+    assert isinstance(again, ShowQuantity) and again.key == key
+    observation, info = env.reset(options={"variation": 3})
+    seen = [observation["quantity"].item()]
+    told = [info[key]]
+    for _ in range(3):
+        observation, *_, info = env.step(env.action_space.sample())
+        seen.append(observation["quantity"].item())
+        told.append(info[key])
+    assert seen == pytest.approx(told, rel=1e-6) and len(set(seen)) == 4
+    assert observation["image"].shape == (40, 40, 3)
+
+
+def test_the_true_quantity_needs_an_image():
+    with pytest.raises(ValueError, match="observes images"):
+        ShowQuantity(gym.make(ID, obs_type="state"))
+
+
+def test_success_alone_is_rewarded():
+    env = SuccessReward(gym.make("FallingBall-v0", image_size=40), scale=3.0)
+    env.reset(seed=0)
+    done, rewards, successes = False, [], []
+    while not done:
+        _, reward, _, done, info = env.step(env.action_space.sample())
+        rewards.append(reward)
+        successes.append(info["is_success"])
+    assert rewards == [3.0 * success for success in successes] and set(successes) == {False, True}
+    with pytest.raises(ValueError, match="scale"):
+        SuccessReward(env, scale=0.0)
+
+
+def pictures(steps=9, **kwargs):
+    """Images of a scene in which nothing moves but the distraction."""
+    env = Distraction(gym.make(ID, image_size=40), **kwargs)
+    first = env.reset(options={"variation": 3})[0]
+    return [first, *(env.step(np.zeros(3, np.float32))[0] for _ in range(steps))]
+
+
+@pytest.mark.filterwarnings("ignore:.*is different from the unwrapped")
+@pytest.mark.parametrize("motion", ["swing", "drift"])
+def test_a_distraction_is_a_part_of_the_scene(motion):
+    env = Distraction(gym.make("FallingBall-v0", image_size=40), motion=motion, jitter=2)
+    check_env(env, skip_render_check=True)
+    assert gym.make(env.spec).motion == motion
+    one, other = (pictures(motion=motion, jitter=2, strength=0.5) for _ in range(2))
+    assert all(map(np.array_equal, one, other))
+    assert not np.array_equal(one[0], one[1])
+    undistracted = gym.make(ID, image_size=40).reset(options={"variation": 3})[0]
+    assert np.array_equal(pictures(motion=motion, strength=0.0)[0], undistracted)
+    assert not np.array_equal(pictures(motion=motion, strength=0.0, jitter=2)[0], undistracted)
+
+
+def test_a_swing_comes_back_and_a_drift_moves_on():
+    swing, drift = (pictures(motion=motion, strength=1.0) for motion in ("swing", "drift"))
+    assert np.array_equal(swing[0], swing[Distraction.period])
+    assert not np.array_equal(drift[0], drift[Distraction.period])
+    for before, after in itertools.pairwise(drift):
+        assert np.array_equal(np.roll(before, Distraction.speed, axis=1), after)
+
+
+@pytest.mark.parametrize(
+    "arguments", [dict(motion="jump"), dict(motion="swing", strength=2.0), dict(motion="drift", jitter=-1)]
+)
+def test_wrong_distractions_are_refused(arguments):
+    with pytest.raises(ValueError, match=list(arguments)[-1]):
+        Distraction(gym.make(ID, image_size=40), **arguments)
+    with pytest.raises(ValueError, match="observes images"):
+        Distraction(gym.make(ID, obs_type="state"), motion="swing")
 
 
 def test_an_episode_does_not_inherit_the_performance_of_the_last_one():

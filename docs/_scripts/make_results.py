@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 from scipy.integrate import trapezoid
 
 from sb3_por.analysis.figures import plot, plot_order
@@ -99,6 +100,54 @@ def comparison(suite: str) -> str:
     return markdown(head, rows)
 
 
+def areas_of(suite: str) -> pd.DataFrame:
+    """Area under each learning curve, divided by the agent steps from the first to the last evaluation: a row a run."""
+    scores = read_scores([RESULTS / suite / "scores.csv"]).sort_values("step")
+    last = scores.groupby(["env", "algo", "seed"]).tail(1).set_index(["env", "algo", "seed"])
+    runs = scores.groupby(["env", "algo", "seed"])
+    areas = pd.Series({key: trapezoid(run[METRIC], run["step"]) / np.ptp(run["step"]) for key, run in runs})
+    return last.assign(**{METRIC: areas}).reset_index()
+
+
+def ratio_of(runs: pd.DataFrame, algo: str, rivals: Iterable[str]) -> str:
+    """Ratio of an algorithm's mean to that of its best rival, in which the bootstrap includes the choice of the rival."""
+    ratios = plot(runs[runs["algo"].isin([algo, *rivals])], "ratio")[0].table.set_index("algo")
+    return with_interval(*ratios.loc[algo, ["ratio", "low", "high"]])
+
+
+def claims() -> str:
+    """Tabulate the paper's gains in efficiency beside what has been measured here."""
+    rows = []
+    for task, gain, suite, rivals in (
+        ("PourWater-v0", "1.32", "main", RIVALS),
+        ("PourWaterAmount-v0", "1.11", "", ()),
+        ("StraightenRope-v0", "1.04", "", ()),
+        ("FoldCloth-v0", "1.02", "fold", ()),
+    ):
+        cells = ["not run"] + ["-"] * 4 + ["0"]
+        if suite:
+            final, areas = read_scores([RESULTS / suite / "scores.csv"]), areas_of(suite)
+            final = final[final["step"] == final["step"].max()]
+            cells = [
+                ratio_of(runs, "sac_por", others) if others else "not run"
+                for others in (rivals, ("por_lambda_0",))
+                for runs in (areas, final)
+            ]
+            cells += [f"`python -m sb3_por suite {suite}`", str(areas["seed"].nunique())]
+        rows.append((f"`{task}`", gain, *cells[:4], cells[5], cells[4]))
+    head = (
+        "task",
+        "the paper",
+        "area, POR / best rival",
+        "last score, POR / best rival",
+        "area, POR / λ = 0",
+        "last score, POR / λ = 0",
+        "seeds",
+        "command",
+    )
+    return markdown(head, rows)
+
+
 def rivals() -> str:
     """Tabulate POR and its ablation lambda = 0 against the paper's rivals."""
     scores = read_scores([RESULTS / "main" / "scores.csv"])
@@ -110,22 +159,56 @@ def rivals() -> str:
     return markdown(("", "best of the three", "ratio"), rows)
 
 
-def areas() -> str:
-    """Tabulate the area under each learning curve on pouring."""
-    scores = read_scores([RESULTS / "main" / "scores.csv"]).sort_values("step")
-    table = {key: trapezoid(run[METRIC], run["step"]) / np.ptp(run["step"]) for key, run in scores.groupby(["algo", "seed"])}
-    areas = pd.Series(table).unstack()
-    means = areas.mean(axis=1).sort_values(ascending=False)
-    rows = [
-        (
-            f"`{algo}`",
-            f"{mean:.2f}",
-            ", ".join(f"{area:.2f}" for area in areas.loc[algo]),
-            f"{mean / means['por_lambda_0']:.2f}",
-        )
-        for algo, mean in means.items()
-    ]
-    return markdown(("", "mean area", "each seed", "of `por_lambda_0`"), rows)
+def paired(difference: pd.Series) -> tuple[str, str]:
+    """Mean of paired differences with a 95 % t-interval, and their standard deviation; dashes where one pair has none."""
+    difference = difference.dropna()
+    n, mean, deviation = len(difference), difference.mean(), difference.std(ddof=1)
+    if n < 2:
+        return f"{mean:+.2f}", "-"
+    half = stats.t.ppf(0.975, n - 1) * deviation / np.sqrt(n)
+    return f"{mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}]", f"{deviation:.2f}"
+
+
+def areas(suite: str) -> str:
+    """Tabulate the area under each learning curve, and the differences to lambda = 0 with the same seed."""
+    areas = areas_of(suite).pivot(index="algo", columns="seed", values=METRIC)
+    scores = read_scores([RESULTS / suite / "scores.csv"])
+    last = scores[scores["step"] == scores["step"].max()].pivot(index="algo", columns="seed", values=METRIC)
+    rows = []
+    for algo in areas.mean(axis=1).sort_values(ascending=False).index:
+        own = areas.loc[algo]
+        differences = ["-"] * 3
+        if algo != "por_lambda_0":
+            differences = [*paired(own - areas.loc["por_lambda_0"]), paired(last.loc[algo] - last.loc["por_lambda_0"])[0]]
+        each = ", ".join("-" if pd.isna(area) else f"{area:.2f}" for area in own)
+        rows.append((f"`{algo}`", f"{own.mean():.2f}", each, *differences))
+    head = (
+        "",
+        "mean area",
+        "each seed",
+        "difference to `por_lambda_0`",
+        "standard deviation of differences",
+        "difference of last scores",
+    )
+    return markdown(head, rows)
+
+
+def power() -> str:
+    """Tabulate the paired seeds at which a t-test finds a difference of areas in four of five studies."""
+    areas = areas_of("main").pivot(index="algo", columns="seed", values=METRIC).drop(index="por_paper")
+    differences = areas.sub(areas.loc["por_lambda_0"]).drop(index="por_lambda_0")
+    deviation = np.sqrt(differences.var(axis=1, ddof=1).mean())
+    rows = []
+    for difference in (0.3, 0.2, 0.15, 0.1, 0.05):
+        n = next(n for n in range(2, 1000) if _power(difference / deviation, n) >= 0.8)
+        rows.append((f"{difference:.2f}", f"{deviation:.2f}", str(n)))
+    return markdown(("difference of areas", "standard deviation of paired differences", "seeds"), rows)
+
+
+def _power(effect: float, n: int) -> float:
+    """Power of a two-sided paired t-test at 5 %, for a difference in units of its standard deviation."""
+    bound, shift = stats.t.ppf(0.975, n - 1), effect * np.sqrt(n)
+    return float(stats.nct.sf(bound, n - 1, shift) + stats.nct.cdf(-bound, n - 1, shift))
 
 
 def weights() -> str:
@@ -310,7 +393,10 @@ def metrics_of(objective: str) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "comparison": lambda: comparison("main"),
     "rivals": rivals,
-    "areas": areas,
+    "claims": claims,
+    "areas": lambda: areas("main"),
+    "areas_fold": lambda: areas("fold"),
+    "power": power,
     "full_speed": lambda: comparison("full_speed"),
     "weights": weights,
     "longer": lambda: courses("long"),

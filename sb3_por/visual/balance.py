@@ -70,7 +70,9 @@ class GradientBalance:
         :param gradients: Gradients of one batch
         """
         norms = th.stack([gradients.critic.norm(), gradients.objective.norm()])
-        self.norms = th.where(self.norms.isnan(), norms, self.norms.lerp(norms, SMOOTHING))
+        # From 0, unlike from the first measurement, which would count ten times as much as the second. The bias of both
+        # averages, which Adam corrects, cancels in their quotient
+        self.norms = self.norms.nan_to_num(0.0).lerp(norms, SMOOTHING)
 
     @property
     def weight(self) -> th.Tensor:

@@ -80,7 +80,7 @@ def test_norms_are_averaged_not_their_quotients():
     balance.measure(gradients([3.0, 4.0], [0.0, 2.0]))
     assert balance.weight == pytest.approx(0.1 * 5 / 2)
     balance.measure(gradients([0.0, 0.0], [0.0, 12.0]))
-    assert balance.weight == pytest.approx(0.1 * (5 - 5 * SMOOTHING) / (2 + 10 * SMOOTHING))
+    assert balance.weight == pytest.approx(0.1 * 5 * (1 - SMOOTHING) / (2 * (1 - SMOOTHING) + 12))
 
 
 def test_an_objective_without_a_gradient_has_no_weight():

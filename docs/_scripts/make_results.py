@@ -205,6 +205,22 @@ def power() -> str:
     return markdown(("difference of areas", "standard deviation of paired differences", "seeds"), rows)
 
 
+def balance() -> str:
+    """Tabulate who trains the encoder under fixed and balanced weights: in the first and in the last updates."""
+    table = pd.read_csv(RESULTS / "balance" / "balance.csv")
+    table["ratio"] = table["grad_norm_por"] / table["grad_norm_critic"]
+    rows = []
+    for coef, run in table.groupby("por_coef", sort=False):
+        ends = run.sort_values("update").iloc[[0, -1]]
+        cells = (
+            f"{start:.3g}, {end:.3g}" for start, end in (ends[name] for name in ("weight", "ratio", "cosine", "accuracy"))
+        )
+        rows.append((f"`{coef}`", *cells))
+    first, last = table["update"].min(), table["update"].max()
+    head = ("`por_coef`", "λ", "gradient of λ POR / critic's", "cosine", "accuracy")
+    return markdown((f"{head[0]}; updates to {first}, to {last}", *head[1:]), rows)
+
+
 def _power(effect: float, n: int) -> float:
     """Power of a two-sided paired t-test at 5 %, for a difference in units of its standard deviation."""
     bound, shift = stats.t.ppf(0.975, n - 1), effect * np.sqrt(n)
@@ -397,6 +413,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "areas": lambda: areas("main"),
     "areas_fold": lambda: areas("fold"),
     "power": power,
+    "balance": balance,
     "full_speed": lambda: comparison("full_speed"),
     "weights": weights,
     "longer": lambda: courses("long"),

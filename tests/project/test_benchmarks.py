@@ -20,7 +20,7 @@ def load(name):
     return module
 
 
-encoders, learner = load("encoders"), load("learner")
+balance, encoders, learner = load("balance"), load("encoders"), load("learner")
 
 
 @pytest.mark.parametrize("name", learner.ALGORITHMS)
@@ -61,3 +61,16 @@ def test_a_probe_reads_what_an_agents_features_tell(tmp_path):
     unrelated = (frames, th.randn(targets.shape) * targets.std(dim=0) + targets.mean(dim=0))
     held_out = (frames, unrelated[1][th.randperm(len(frames))])
     assert told["error_cm"] < 0.5 * encoders.probe(tmp_path / "model.zip", unrelated, held_out, arguments)["error_cm"]
+
+
+def test_gradients_are_followed_under_each_kind_of_weight(monkeypatch):
+    monkeypatch.setattr(balance, "INTERVAL", 20)
+    ratios = {}
+    for coef in (0.0, 100.0, "auto_0.1"):
+        model = balance.make_model(DotEnv(falling=True), coef, seed=0, n_frames=60).learn(60)
+        rows = [dict(zip(("update", *balance.METRICS), row, strict=True)) for row in balance.follow(model, 40)]
+        assert [row["update"] for row in rows] == [20, 40] and model._n_updates == 40
+        ratios[coef] = rows[0]["encoder_grad_norm_por"] / rows[0]["encoder_grad_norm_critic"]
+        if coef != "auto_0.1":
+            assert {row["por_coef"] for row in rows} == {coef}
+    assert ratios[0.0] == 0.0 and ratios[100.0] > 10 * ratios["auto_0.1"] > 0.5

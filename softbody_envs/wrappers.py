@@ -123,24 +123,31 @@ class ShowQuantity(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Reco
 
 class SuccessReward(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.RecordConstructorArgs):
     """
-    Reward success alone: a sparse reward, ``scale`` at each step at which ``info["is_success"]`` holds, else 0.
+    Reward success alone: a sparse reward, ``scale`` at each step at which ``info["is_success"]`` holds, or the normalized
+    performance is at least a threshold, else 0. Inside ``ActionRepeat`` every control step of a success counts, outside of it
+    every action that ends in one.
 
-    :param env: Environment that reports ``info["is_success"]``
+    :param env: Environment that reports ``info["is_success"]``, or ``info["normalized_performance"]`` for a threshold
     :param scale: Reward of a step, above 0
-    :raises ValueError: If ``scale`` is not above 0
+    :param threshold: Smallest normalized performance of a success; 0 is that of the reset, 1 is perfect. None for the task's
+        own ``is_success``
+    :raises ValueError: If ``scale`` is not above 0, or ``threshold`` is not, so that doing nothing would be a success
     """
 
-    def __init__(self, env: gym.Env[Any, np.ndarray], scale: float = 1.0):
-        gym.utils.RecordConstructorArgs.__init__(self, scale=scale)
+    def __init__(self, env: gym.Env[Any, np.ndarray], scale: float = 1.0, threshold: float | None = None):
+        gym.utils.RecordConstructorArgs.__init__(self, scale=scale, threshold=threshold)
         gym.Wrapper.__init__(self, env)
         if not scale > 0.0:
             raise ValueError(f"scale must be above 0, got {scale!r}")
-        self.scale = scale
+        if threshold is not None and not threshold > 0.0:
+            raise ValueError(f"threshold must be above 0, got {threshold!r}")
+        self.scale, self.threshold = scale, threshold
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See ``gymnasium.Env.step``."""
         observation, _, terminated, truncated, info = self.env.step(action)
-        return observation, self.scale * float(info["is_success"]), terminated, truncated, info
+        success = info["is_success"] if self.threshold is None else info["normalized_performance"] >= self.threshold
+        return observation, self.scale * float(success), terminated, truncated, info
 
 
 class Distraction(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.RecordConstructorArgs):

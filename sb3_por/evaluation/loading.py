@@ -18,7 +18,7 @@ from sb3_por.evaluation.environment import make_wrapped, observation_kwargs
 from sb3_por.evaluation.episodes import Model, whole_episodes
 from sb3_por.evaluation.model_files import LOADABLE, candidates, model_file, read_data
 from sb3_por.evaluation.safe_loading import check_environment, failing_in_one_line, is_plain, load_safe
-from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, VecEnvWrapper, import_wrappers
+from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, VecEnvWrapper, import_wrappers, without_ranker
 from sb3_por.runs.folder import (
     ARGUMENTS,
     BEST_MODEL,
@@ -195,7 +195,7 @@ def _arguments(
     missing = made_of.normalizes_observations and statistics is None
     if made_of.env_id == env_id.rpartition(":")[2]:
         arguments["env_kwargs"] = whole_episodes(import_names(made_of.env_kwargs or {}))
-        arguments["env_wrapper"] = import_wrappers(made_of.env_wrapper)
+        arguments["env_wrapper"] = import_wrappers(without_ranker(made_of.env_wrapper))
         arguments["vec_env_wrapper"] = import_wrappers(made_of.vec_env_wrapper)
         missing = missing or bool(made_of.unknown)
     elif made_of.env_wrapper or made_of.vec_env_wrapper or made_of.unknown:

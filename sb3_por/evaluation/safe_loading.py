@@ -24,7 +24,7 @@ from sb3_por.common.checks import check_types
 from sb3_por.common.errors import UserError, check_known, one_line, short
 from sb3_por.evaluation.model_files import LOADABLE, candidates, model_file
 from sb3_por.evaluation.plain_files import lacks_values, read_json, read_tensors
-from sb3_por.runs.environment import TrainingEnvironment
+from sb3_por.runs.environment import TrainingEnvironment, without_ranker
 from sb3_por.runs.folder import ClassName
 from sb3_por.visual import encoders
 from softbody_envs.registration import task_class
@@ -106,7 +106,7 @@ def check_environment(made_of: TrainingEnvironment) -> None:
     :param made_of: A stranger's description of an environment
     :raises UserError: If making it could run code of the stranger's choice; names the part
     """
-    for spec in (made_of.env_wrapper, made_of.vec_env_wrapper):
+    for spec in (without_ranker(made_of.env_wrapper), made_of.vec_env_wrapper):
         for one in spec if isinstance(spec, list) else [spec] if spec else []:
             name, arguments = next(iter(one.items())) if isinstance(one, dict) and len(one) == 1 else (one, {})
             if name not in WRAPPERS:

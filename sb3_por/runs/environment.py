@@ -20,6 +20,8 @@ EnvWrapper = Callable[[gym.Env], gym.Env]
 VecEnvWrapper = Callable[[VecEnv], VecEnv]
 #: Attribute of a model that holds the text of a ``TrainingEnvironment``; saved in its ``.zip``
 ATTRIBUTE = "training_environment"
+#: Path of the wrapper that adds a ranker's potential to the rewards
+RANKED_PROGRESS = "sb3_por.ranking.progress.RankedProgress"
 
 
 @dataclass(frozen=True)
@@ -162,6 +164,15 @@ def import_wrappers(spec: Any) -> Callable[[Any], Any] | None:
         return env
 
     return wrap
+
+
+def without_ranker(spec: Any) -> Any:
+    """
+    :param spec: Wrappers, see :func:`import_wrappers`
+    :return: The same without ``RankedProgress``, which changes rewards alone and needs a file: scores are the task's own
+    """
+    specs = spec if isinstance(spec, list) else [spec] if spec else []
+    return [one for one in specs if RANKED_PROGRESS not in ([*one] if isinstance(one, dict) else [one])]
 
 
 def _import_wrapper(spec: Any) -> Callable[[Any], Any]:

@@ -26,6 +26,7 @@ from sb3_por.runs.checkpoints import (
     remove_checkpoints,
 )
 from sb3_por.runs.folder import ARGUMENTS, import_names, last_model, run_arguments, the_run
+from sb3_por.ranking.ranker import Ranker
 from sb3_por.runs.provenance import current_commit, current_machine, current_provenance, differences
 
 EXAMPLE = """example:
@@ -114,6 +115,10 @@ class Parser(argparse.ArgumentParser):
         )
         demos = "folder of demonstrations, from which half of each batch is drawn; see python -m sb3_por record"
         self.add_argument("--demos", metavar="FOLDER", help=demos)
+        ranker = "ranker whose progress is added to the reward; see python -m sb3_por rank (--progress is the zoo's bar)"
+        self.add_argument("--ranker", metavar="FILE", help=ranker)
+        kwargs = "arguments of RankedProgress: scale:10.0, and gamma:0.99 for potential-based shaping"
+        self.add_argument("--ranker-kwargs", nargs="+", default={}, action=Settings, metavar="KEY:VALUE", help=kwargs)
         self.add_argument("--label", metavar="NAME", help="what tables and figures call the run, instead of its algorithm")
         args = super().parse_args()
         if args.resume:
@@ -157,6 +162,10 @@ class Parser(argparse.ArgumentParser):
             raise UserError(f"--device {args.device}: PyTorch finds no CUDA device here; pass --device cpu")
         if not args.log_folder:
             self.error("-f needs the name of a folder")
+        if args.ranker:
+            Ranker.load(args.ranker)
+        elif args.ranker_kwargs:
+            self.error("--ranker-kwargs are about a ranker: give --ranker, too")
 
     def _resumed(self, run: Path) -> argparse.Namespace:
         """The arguments that a run was started with, changed by those given now."""

@@ -32,7 +32,7 @@ from sb3_por.runs.checkpoints import (
     restore_buffer,
     restore_monitors,
 )
-from sb3_por.runs.environment import TrainingEnvironment, read_normalization
+from sb3_por.runs.environment import RANKED_PROGRESS, TrainingEnvironment, read_normalization, without_ranker
 from sb3_por.runs.folder import (
     ARGUMENTS,
     BEST_STATISTICS,
@@ -97,6 +97,9 @@ class Experiment(ExperimentManager):
             saved = import_names(read_settings(self._resumed_run / self.env_name / HYPERPARAMETERS)) | changes
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
+        if self.args.ranker:
+            ranked = {RANKED_PROGRESS: {"ranker": self.args.ranker, **self.args.ranker_kwargs}}
+            hyperparams["env_wrapper"] = saved["env_wrapper"] = [*without_ranker(saved.get("env_wrapper")), ranked]
         if "normalize" in saved:
             hyperparams["normalize"] = saved["normalize"] = read_normalization(saved["normalize"])
             check_types(VecNormalize, saved["normalize"] if isinstance(saved["normalize"], dict) else {})

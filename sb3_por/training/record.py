@@ -1,6 +1,6 @@
 """Record demonstrations: a policy plays training scenes in the environment that an algorithm's settings make."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from sb3_por.demonstrations.dataset import RecordedEpisode, check_new, write_dem
 from sb3_por.evaluation.environment import make_evaluation_env
 from sb3_por.evaluation.episodes import Episode, Evaluation, FixedEpisodes, Model, run_episodes
 from sb3_por.evaluation.loading import resolve
-from sb3_por.runs.environment import TrainingEnvironment, import_wrappers
+from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, import_wrappers
 from sb3_por.runs.folder import import_names
 from sb3_por.training.arguments import hyperparameter_file
 from softbody_envs.experts import make_expert
@@ -93,6 +93,7 @@ def settings_environment(
     conf_file: str | None = None,
     changes: dict[str, Any] | None = None,
     env_kwargs: dict[str, Any] | None = None,
+    demos: bool = True,
 ) -> TrainingEnvironment:
     """
     :param algo: Name of an algorithm
@@ -100,10 +101,11 @@ def settings_environment(
     :param conf_file: Settings in the RL Zoo's format; the file that ``train.py`` would choose by default
     :param changes: Changes to the settings
     :param env_kwargs: Changes to the arguments of the environment
-    :return: The environment that ``train.py --demos`` would train in
+    :param demos: Whether it is for learning from demonstrations
+    :return: The environment that ``train.py``, with ``--demos`` or without, would train in
     :raises UserError: If there are no settings
     """
-    file = Path(conf_file) if conf_file else hyperparameter_file(algo, env_id, demos=True)
+    file = Path(conf_file) if conf_file else hyperparameter_file(algo, env_id, demos)
     try:
         settings = yaml.safe_load(file.read_text())
         settings = {**(settings[env_id] if env_id in settings else settings["default"]), **(changes or {})}
@@ -111,6 +113,22 @@ def settings_environment(
         raise UserError(f"cannot read settings for {env_id} from {file}: {one_line(error)}") from error
     settings["env_kwargs"] = {**(settings.get("env_kwargs") or {}), **(env_kwargs or {})}
     return TrainingEnvironment.of_settings(env_id, settings)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """
+    Episodes of training scenes.
+
+    :param evaluation: Their scores
+    :param episodes: The episodes, as the environment inside its wrappers gave them: before frames are stacked and observations
+        normalized
+    :param env: The environment, closed
+    """
+
+    evaluation: Evaluation
+    episodes: list[RecordedEpisode]
+    env: gym.Env[Any, np.ndarray]
 
 
 def record(
@@ -123,44 +141,72 @@ def record(
     safe: bool = False,
 ) -> Evaluation:
     """
-    Record episodes of training scenes, never of held-out ones, as a Minari dataset. What is recorded is what the environment
-    inside its wrappers gives and takes, before frames are stacked and observations normalized.
+    Write episodes of training scenes as a Minari dataset.
 
-    :param model: ``"expert"`` for the task's scripted expert, a run folder, the path of a model, or a model
+    :param model: See :func:`find_player`
     :param env_id: Gymnasium id
     :param path: Folder of the new dataset
-    :param n_episodes: Number of episodes, of different scenes as long as there are any left
-    :param seed: Chooses the scenes; episode k is reset with ``seed + k``
-    :param made_of: Parts of the environment; by default those that the model was trained in, and for the expert those of
-        ``sac_por``
+    :param n_episodes: See :func:`play_training_scenes`
+    :param seed: See :func:`play_training_scenes`
+    :param made_of: See :func:`find_player`
     :param safe: Run nothing that the model's file or folder holds
     :return: The scores of the episodes
     :raises UserError: If the model or the environment cannot be made, or the folder cannot be written
     """
-    if n_episodes < 1:
-        raise UserError(f"a recording needs at least 1 episode, got {n_episodes}")
     check_new(path)
+    player, environment = find_player(model, env_id, made_of, safe)
+    recording = play_training_scenes(player, env_id, environment, n_episodes, seed)
+    write_demonstrations(
+        path,
+        recording.episodes,
+        recording.env.observation_space,
+        recording.env.action_space,
+        recording.env.spec,
+        algorithm_name=model if isinstance(model, str) else type(player).__name__,
+        description=f"{env_id}: {recording.evaluation}",
+    )
+    return recording.evaluation
+
+
+def find_player(
+    model: Model | str | Path, env_id: str, made_of: TrainingEnvironment | None = None, safe: bool = False
+) -> tuple[Any, dict[str, Any]]:
+    """
+    :param model: ``"expert"`` for the task's scripted expert, a run folder, the path of a model, or a model
+    :param env_id: Gymnasium id
+    :param made_of: Parts of the environment; by default those that the model was trained in, and for the expert those of
+        ``sac_por``
+    :param safe: Run nothing that the model's file or folder holds
+    :return: The model, None for the expert; and arguments of ``make_evaluation_env``
+    :raises UserError: If the model cannot be loaded
+    """
     loaded, environment = (None, {}) if model == EXPERT else resolve(model, env_id, safe=safe)
     if made_of is None and loaded is None:
         made_of = settings_environment("sac_por", env_id)
-    if made_of is not None:
-        environment["env_kwargs"] = import_names(made_of.env_kwargs or {})
-        environment["env_wrapper"] = import_wrappers(made_of.env_wrapper)
-    environment["env_kwargs"] = environment["env_kwargs"] | ({"split": "train"} if task_class(env_id) is not None else {})
-    wrap = environment["env_wrapper"] or (lambda env: env)
-    try:
-        env = wrap(gym.make(env_id, **environment["env_kwargs"]))
-    except (TypeError, ValueError, gym.error.Error) as error:
-        raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
-    spec = env.spec  # without what records and monitors
+    return loaded, environment | (environment_parts(made_of) if made_of is not None else {})
 
+
+def play_training_scenes(player: Any, env_id: str, environment: dict[str, Any], n_episodes: int, seed: int = 0) -> Recording:
+    """
+    Play episodes of training scenes, never of held-out ones.
+
+    :param player: A model, or None for the task's scripted expert
+    :param env_id: Gymnasium id
+    :param environment: Arguments of ``make_evaluation_env``
+    :param n_episodes: Number of episodes, of different scenes as long as there are any left
+    :param seed: Chooses the scenes; episode k is reset with ``seed + k``
+    :return: The episodes and their scores
+    :raises UserError: If the environment cannot be made
+    """
+    if n_episodes < 1:
+        raise UserError(f"a recording needs at least 1 episode, got {n_episodes}")
+    env = make_training_env(env_id, environment["env_kwargs"], environment["env_wrapper"])
     recorder = Recorder(Monitor(env))
-    if loaded is None:
-        player: Any = AttachedExpert(env_id, env)
+    if player is None:
+        player = AttachedExpert(env_id, env)
         venv: VecEnv = DummyVecEnv([lambda: FixedEpisodes(recorder)])
     else:
-        player = loaded
-        venv = make_evaluation_env(loaded, env_id, **environment | {"env_wrapper": lambda _: recorder})
+        venv = make_evaluation_env(player, env_id, **environment | {"env_wrapper": lambda _: recorder})
     try:
         evaluations, recorded = [], []
         for episode in training_episodes(env_id, n_episodes, seed):
@@ -169,17 +215,32 @@ def record(
             recorded.append(demonstration)
     finally:
         venv.close()
-    evaluation = _joined(evaluations)
-    write_demonstrations(
-        path,
-        recorded,
-        recorder.observation_space,
-        recorder.action_space,
-        spec,
-        algorithm_name=model if isinstance(model, str) else type(loaded).__name__,
-        description=f"{env_id}: {evaluation}",
-    )
-    return evaluation
+    return Recording(_joined(evaluations), recorded, env)
+
+
+def make_training_env(env_id: str, env_kwargs: dict[str, Any], env_wrapper: EnvWrapper | None) -> gym.Env[Any, np.ndarray]:
+    """
+    :param env_id: Gymnasium id
+    :param env_kwargs: Arguments of the environment's constructor
+    :param env_wrapper: Wrappers
+    :return: The environment, with training scenes
+    :raises UserError: If it cannot be made
+    """
+    kwargs = env_kwargs | ({"split": "train"} if task_class(env_id) is not None else {})
+    try:
+        env: gym.Env[Any, np.ndarray] = gym.make(env_id, **kwargs)
+        return env if env_wrapper is None else env_wrapper(env)
+    except (TypeError, ValueError, gym.error.Error) as error:
+        raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
+
+
+def environment_parts(made_of: TrainingEnvironment) -> dict[str, Any]:
+    """
+    :param made_of: Parts of an environment by their names
+    :return: ``env_kwargs`` and ``env_wrapper`` for ``make_training_env``
+    :raises UserError: If a wrapper cannot be imported
+    """
+    return {"env_kwargs": import_names(made_of.env_kwargs or {}), "env_wrapper": import_wrappers(made_of.env_wrapper)}
 
 
 def training_episodes(env_id: str, n_episodes: int, seed: int) -> list[Episode]:

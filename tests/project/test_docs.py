@@ -156,9 +156,10 @@ def test_a_command_that_does_not_exist_is_noticed(check_train):
 
 @pytest.mark.parametrize("name, number, block", blocks("python"))
 def test_python_runs(name, number, block, tmp_path, monkeypatch):
-    """In small sizes: learning for 110 steps, a small replay buffer, evaluating one episode."""
+    """In small sizes: learning for 110 steps, 100 updates of a ranker, a small replay buffer, evaluating one episode."""
     monkeypatch.chdir(tmp_path)
     block = re.sub(r"\.learn\([\d_]+", ".learn(110", block)
+    block = re.sub(r"updates=\d+", "updates=100", block)
     block = re.sub(r"n_episodes=\d+", "n_episodes=1", block)
     block = re.sub(r"buffer_size=[\d_]+", "buffer_size=200", block)
     block = re.sub(r"batch_size=\d+", "batch_size=8", block)

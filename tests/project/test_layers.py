@@ -13,6 +13,7 @@ LAYERS = (
     "acceleration",
     "demonstrations",
     "visual",
+    "ranking",
     "algorithms",
     "runs",
     "evaluation",

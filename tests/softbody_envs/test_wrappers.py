@@ -9,7 +9,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from softbody_envs.experts import make_expert
+from softbody_envs import ENV_IDS
+from softbody_envs.experts import has_expert, make_expert
+from softbody_envs.experts.pace import Pace
 from softbody_envs.wrappers import ActionRepeat, Distraction, ProgressReward, ShowQuantity, SuccessReward
 
 ID = "PourWater-v0"
@@ -185,3 +187,23 @@ def test_recorders_of_vector_environments_see_the_same_rate():
     assert env.metadata["render_fps"] == pytest.approx(2.5)
     assert gym.make(ID).metadata["render_fps"] == pytest.approx(12.5)
     env.close()
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id in ENV_IDS if has_expert(env_id)])
+def test_a_success_is_rewarded_while_it_lasts_in_every_task(env_id):
+    env = SuccessReward(ActionRepeat(gym.make(env_id, obs_type="state"), 5), threshold=0.5)
+    expert = make_expert(env_id, Pace.of(env))
+    observation, _ = env.reset(seed=0, options={"variation": 3})
+    expert.reset()
+    rewards, done = [], False
+    while not done:
+        observation, reward, _, done, info = env.step(expert.act(observation))
+        rewards.append(reward)
+        assert reward == (1.0 if info["normalized_performance"] >= 0.5 else 0.0)
+    assert set(rewards) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("threshold", [0.0, -0.5, float("nan")])
+def test_a_threshold_that_the_reset_passes_is_refused(threshold):
+    with pytest.raises(ValueError, match="threshold must be above 0"):
+        SuccessReward(gym.make(ID, obs_type="state"), threshold=threshold)

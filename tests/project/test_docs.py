@@ -12,6 +12,7 @@ import yaml
 
 from sb3_por.__main__ import _parse as parse_arguments
 from sb3_por.common.errors import UserError
+from sb3_por.ranking import Ranker
 from sb3_por.suites.suite_file import read_suite
 
 ROOT = Path(__file__).parents[2]
@@ -105,6 +106,7 @@ def check_train(monkeypatch, tmp_path):
             assert zoo.main(arguments) == 0
 
     monkeypatch.chdir(tmp_path)
+    Ranker().save("fold.npz")  # a reader has it
     monkeypatch.setattr(zoo, "Experiment", accept)
     monkeypatch.setattr(
         command_line, "th", SimpleNamespace(cuda=SimpleNamespace(is_available=lambda: True))

@@ -230,7 +230,7 @@ def _times(video: np.ndarray) -> np.ndarray:
 
 def _right(rise: np.ndarray) -> np.ndarray:
     """1 where the later frame is ranked later, 0 where the earlier one is; a tie is half right."""
-    return 0.5 + 0.5 * np.sign(rise)
+    return 0.5 + 0.5 * np.sign(rise.astype(float))
 
 
 def _agreement(potentials: list[np.ndarray], quantities: list[np.ndarray]) -> Agreement:

@@ -18,7 +18,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_por.common.files import DiskError, atomic_write, disk_errors
 from sb3_por.common.random_state import get_rng_state
-from sb3_por.runs.folder import CHECKPOINTS, MONITORS, STATISTICS
+from sb3_por.runs.folder import CHECKPOINTS, MONITORS, STATISTICS, discard, latest_checkpoint
 
 #: Model in the folder of a checkpoint
 MODEL = "model.zip"
@@ -100,24 +100,11 @@ def _block_names(checkpoint: Path) -> list[list[str]]:
     return json.loads(file.read_text()) if file.is_file() else []
 
 
-def latest_checkpoint(run: Path) -> Path | None:
-    """The newest complete checkpoint of a run, if it has one."""
-    found = (run / CHECKPOINTS).glob("step_*")
-    return max(found, key=lambda folder: int(folder.name.removeprefix("step_")), default=None)
-
-
 def remove_checkpoints(run: Path) -> None:
     """Remove all checkpoints of a finished run."""
     for folder in (run / CHECKPOINTS).glob("step_*"):
         discard(folder)
     shutil.rmtree(run / CHECKPOINTS, ignore_errors=True)
-
-
-def discard(checkpoint: Path) -> None:
-    """Remove a checkpoint atomically."""
-    hidden = checkpoint.with_name(f".{uuid.uuid4().hex}")
-    checkpoint.rename(hidden)
-    shutil.rmtree(hidden)
 
 
 def restore_monitors(run: Path, checkpoint: Path) -> None:

@@ -1,5 +1,7 @@
 """A run's folder, in the RL Zoo's layout: where its files are and what its settings say."""
 
+import shutil
+import uuid
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -166,6 +168,19 @@ def the_run(folder: Path) -> Path:
 def is_finished(run: Path, env_id: str) -> bool:
     """Whether a run has its last model and no checkpoint."""
     return (run / last_model(env_id)).exists() and not (run / CHECKPOINTS).exists()
+
+
+def latest_checkpoint(run: Path) -> Path | None:
+    """The newest complete checkpoint of a run, if it has one."""
+    found = (run / CHECKPOINTS).glob("step_*")
+    return max(found, key=lambda folder: int(folder.name.removeprefix("step_")), default=None)
+
+
+def discard(checkpoint: Path) -> None:
+    """Remove a checkpoint atomically."""
+    hidden = checkpoint.with_name(f".{uuid.uuid4().hex}")
+    checkpoint.rename(hidden)
+    shutil.rmtree(hidden)
 
 
 def read_evaluations(run: Path) -> dict[str, np.ndarray]:

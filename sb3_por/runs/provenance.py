@@ -3,34 +3,18 @@
 import os
 import platform
 import re
-import subprocess
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import psutil
 import torch as th
 
-#: Packages whose version can change a run's numbers
-PACKAGES = ("torch", "numpy", "gymnasium", "pybullet", "pybullet-arm64", "stable-baselines3", "sb3-contrib", "rl_zoo3")
+from sb3_por.runs.versions import current_versions
+
 #: Instruction sets of a processor that numerical libraries choose their code by
 VECTOR_FLAGS = re.compile(r"sse\w*|ssse3|avx\w*|fma\d?|f16c|amx\w*|neon|asimd\w*|sve\w*|bf16")
 #: Environment variables that make numerical libraries choose other code
 VARIABLES = ("ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_CBWR", "MKL_ENABLE_INSTRUCTIONS", "NPY_DISABLE_CPU_FEATURES")
-
-
-def current_commit() -> str:
-    """The commit of the checkout that this package runs from, ``+`` if files differ from it; empty without one."""
-    root = Path(__file__).parents[2]
-    if not (root / ".git").exists():
-        return ""
-    git = ["git", "-C", str(root)]
-    try:
-        commit = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)
-        changed = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-    return commit.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
 def current_machine() -> str:
@@ -51,16 +35,14 @@ def current_provenance(threads: int) -> dict[str, Any]:
     Everything that decides whether a run gives the same numbers again, to the last bit: see ``docs/reliability.md``.
 
     :param threads: PyTorch threads of the run; those of this process if not positive
-    :return: Plain values by name: ``commit`` (with ``+`` if files differ from it), ``python``, a version for each of
-        ``PACKAGES``, ``processor``, its vector instructions (``cpu_flags``), those that PyTorch uses (``cpu_capability``),
-        ``threads``, ``accelerator``, and each of ``VARIABLES`` that is set
+    :return: Plain values by name: those of :func:`~sb3_por.runs.versions.current_versions`, ``processor``, its vector
+        instructions (``cpu_flags``), those that PyTorch uses (``cpu_capability``), ``threads``, ``accelerator``, and each of
+        ``VARIABLES`` that is set
     """
     info = Path("/proc/cpuinfo")
     flags = re.findall(r"^(?:flags|Features)\s*:\s*(.+)", info.read_text(), re.MULTILINE) if info.is_file() else []
     return {
-        "commit": current_commit(),
-        "python": platform.python_version(),
-        **{name: _version(name) for name in PACKAGES if _version(name)},
+        **current_versions(),
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
         "cpu_flags": " ".join(sorted(filter(VECTOR_FLAGS.fullmatch, flags[0].split()))) if flags else "",
@@ -71,24 +53,7 @@ def current_provenance(threads: int) -> dict[str, Any]:
     }
 
 
-def differences(before: dict[str, Any], now: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """
-    :param before: A ``current_provenance()`` that a run has recorded
-    :param now: That of this process
-    :return: name: the two values, of all that differ; None for a value that one of them does not have
-    """
-    names = sorted({*before, *now})
-    return {name: (before.get(name), now.get(name)) for name in names if before.get(name) != now.get(name)}
-
-
 def _processor() -> str:
     info = Path("/proc/cpuinfo")
     models = re.findall(r"model name\s*:\s*(.+)", info.read_text()) if info.is_file() else []
     return models[0].strip() if models else platform.machine()
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""

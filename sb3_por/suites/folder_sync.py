@@ -4,10 +4,9 @@ import uuid
 from pathlib import Path
 
 from sb3_por.common.files import atomic_write
-from sb3_por.runs.checkpoints import discard, latest_checkpoint
-from sb3_por.runs.folder import CHECKPOINTS
+from sb3_por.runs.folder import CHECKPOINTS, discard, latest_checkpoint
 from sb3_por.runs.origin import mark_as_own
-from sb3_por.suites.suite_file import Run
+from sb3_por.suites.run import Run
 
 #: Path in ``Run.folder`` -> content of a file that is new or has changed, ``None`` of one that is gone.
 Changes = dict[str, bytes | None]

@@ -1,8 +1,5 @@
 """Pools that do the runs of a suite: processes of this machine here, a cluster in ``ray_pool.py``."""
 
-import ctypes
-import os
-import shutil
 import signal
 import subprocess
 import time
@@ -10,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator
 
 from sb3_por.runs.facts import progress
-from sb3_por.suites.suite_file import Run
+from sb3_por.suites.run import Run, start_process
 
 #: Seconds between two looks at what runs.
 POLL_S = 0.5
@@ -29,18 +26,18 @@ class Pool(ABC):
         self.states = {run: run.state() for run in runs}
         #: When a run began to run (``time.monotonic``) and how many steps it had then
         self.started: dict[Run, tuple[float, int]] = {}
+        self._todo = [run for run in runs if self.states[run] != "finished"]
         self._progress: dict[tuple[Run, str], tuple[int, float | None]] = {}
 
     def work(self) -> Generator[None, None, None]:
         """Do all runs. Yields after each look at them; closing the generator interrupts them."""
-        todo = [run for run in self.runs if self.states[run] != "finished"]
         try:
-            while todo or self._active():
-                while todo and self._has_room():
-                    self._start(todo.pop(0))
+            while self._todo or self._active():
+                while self._todo and self._has_room():
+                    self._start(self._todo.pop(0))
                 self._look()
                 yield
-                if self._active():
+                if self._todo or self._active():
                     time.sleep(POLL_S)
         finally:
             active = self._active()
@@ -114,32 +111,6 @@ class LocalPool(Pool):
             process.wait()
 
 
-def start_process(run: Run, threads: int) -> subprocess.Popen:
-    """
-    Start or resume a run. It dies with the process that calls this, and writes to ``run.log``.
-
-    :param threads: threads of its numerical libraries
-    """
-    command = run.command()
-    if run.state() == "new":
-        # What a process left that was killed before it had written its settings.
-        shutil.rmtree(run.run_folder, ignore_errors=True)
-    run.folder.mkdir(parents=True, exist_ok=True)
-    of_libraries = {name: str(threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
-    # Otherwise an error stands in the log before what was printed earlier and kept in a buffer.
-    in_order = {"PYTHONUNBUFFERED": "1"}
-    with open(run.log, "ab") as log:
-        return subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            env=os.environ | of_libraries | in_order,
-            start_new_session=True,
-            preexec_fn=_die_with_parent,
-        )
-
-
 def final_state(run: Run, end: int | str) -> str:
     """
     :param end: the return code of the run's process, or what kept it from ending; the run's log says it
@@ -153,8 +124,3 @@ def final_state(run: Run, end: int | str) -> str:
     with open(run.log, "a") as log:
         print(f"[{end}]", file=log)
     return "failed"
-
-
-def _die_with_parent() -> None:
-    """A killed suite must not leave processes behind that its next start would run a second time (prctl, Linux)."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)

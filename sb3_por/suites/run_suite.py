@@ -6,7 +6,9 @@ import signal
 import sys
 import time
 import warnings
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -18,6 +20,7 @@ from sb3_por.common.errors import UserNote
 from sb3_por.common.files import check_writable
 from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, read_settings
 from sb3_por.runs.lock import lock_folder
+from sb3_por.suites.cluster import outlive
 from sb3_por.suites.memory import overcommitment
 from sb3_por.suites.pools import LocalPool, Pool
 from sb3_por.suites.suite_file import Run, Suite, find_suite, read_suite, suite_runs
@@ -52,33 +55,43 @@ def run_suite(path: str | Path, root: str | Path = "runs", dry_run: bool = False
     check_writable(folder)
     lock = lock_folder(folder, f"another process is at work on the suite in {folder}; wait for it, or give another --root")
     try:
-        return _do(_pool(suite, runs, workers, ray), folder)
+        if ray is None:
+            return _do(LocalPool(runs, workers, suite.threads), folder)
+        with _interruptible():
+            return outlive(partial(_do_on_cluster, suite, runs, ray, folder))
     finally:
         lock.release()
 
 
-def _pool(suite: Suite, runs: list[Run], workers: int, ray: str | None) -> Pool:
-    if ray is None:
-        return LocalPool(runs, workers, suite.threads)
+def _do_on_cluster(suite: Suite, runs: list[Run], address: str, folder: Path, reached: Callable[[str], None]) -> int:
     from sb3_por.suites.ray_pool import RayPool
 
-    return RayPool(runs, suite.threads, suite.gpus, ray)
+    pool = RayPool(runs, suite.threads, suite.gpus, address)
+    reached(pool.head)
+    return _do(pool, folder)
 
 
 def _do(pool: Pool, folder: Path) -> int:
     console = Console(stderr=True)
-    handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+    with _interruptible():
         _show_work(pool, console)
-    except KeyboardInterrupt as interrupt:
-        raise KeyboardInterrupt("interrupted; the same command resumes it") from interrupt
-    finally:
-        signal.signal(signal.SIGTERM, handler)
     console.print(progress_table(pool))
     if any(run.run_folder.joinpath(EVALUATIONS).exists() for run in pool.runs):
         write_csv(read_scores([folder]), folder / "scores.csv")
         print(folder / "scores.csv")
     return _name_failed(pool)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM is as Ctrl-C, and both are told as an end from which the suite can be resumed."""
+    handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt("interrupted; the same command resumes it") from interrupt
+    finally:
+        signal.signal(signal.SIGTERM, handler)
 
 
 def _show_work(pool: Pool, console: Console) -> None:

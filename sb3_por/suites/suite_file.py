@@ -1,6 +1,5 @@
 """Suite files: the runs that one describes, and the command of each."""
 
-import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por.common.errors import UserError, check_known, one_line
 from sb3_por.common.shipped import shipped
 from sb3_por.evaluation.loading import LOADABLE, import_packages
-from sb3_por.runs.folder import LOG, is_finished, run_arguments
+from sb3_por.suites.run import Run
 
 
 @dataclass(frozen=True)
@@ -52,52 +51,6 @@ class Suite:
     workers: int | None = None
     threads: int = 1
     gpus: float = 0
-
-
-@dataclass(frozen=True)
-class Run:
-    """
-    One run of a suite.
-
-    :param folder: ``<root>/<env>/<algo or variant>/seed_<seed>``; the zoo's layout begins in it
-    :param flags: Flags of train.py besides algorithm, environment, seed, folder and label
-    :param variant: name of the suite's variant; empty for the algorithm itself
-    """
-
-    algo: str
-    env: str
-    seed: int
-    folder: Path
-    flags: tuple[str, ...]
-    variant: str = ""
-
-    @property
-    def name(self) -> str:
-        return f"{self.env}/{self.variant or self.algo}/seed_{self.seed}"
-
-    @property
-    def run_folder(self) -> Path:
-        """Folder to which train.py writes."""
-        return self.folder / self.algo / f"{self.env}_1"
-
-    @property
-    def log(self) -> Path:
-        return self.folder / LOG
-
-    def state(self) -> str:
-        """``"finished"``, ``"interrupted"``, or ``"new"``."""
-        if is_finished(self.run_folder, self.env):
-            return "finished"
-        return "interrupted" if run_arguments(self.run_folder) else "new"
-
-    def command(self) -> list[str]:
-        """The command that starts or resumes the run."""
-        train = [sys.executable, "-m", "sb3_por.zoo"]
-        if self.state() == "interrupted":
-            return [*train, "--resume", str(self.run_folder)]
-        named = ["--algo", self.algo, "--env", self.env, "--seed", str(self.seed), "-f", str(self.folder)]
-        label = ["--label", self.variant] if self.variant else []
-        return [*train, *named, *label, *self.flags]
 
 
 def suite_runs(suite: Suite, root: Path) -> list[Run]:

@@ -27,7 +27,8 @@ from sb3_por.runs.checkpoints import (
 )
 from sb3_por.runs.folder import ARGUMENTS, import_names, last_model, run_arguments, the_run
 from sb3_por.ranking.ranker import Ranker
-from sb3_por.runs.provenance import current_commit, current_machine, current_provenance, differences
+from sb3_por.runs.provenance import current_machine, current_provenance
+from sb3_por.runs.versions import current_commit, differences
 
 EXAMPLE = """example:
   python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:10.0 pairing:paper

@@ -8,9 +8,10 @@ from importlib.metadata import version
 import pytest
 import torch as th
 
-from sb3_por.runs import provenance
+from sb3_por.runs import versions
 from sb3_por.runs.folder import read_settings, write_settings
-from sb3_por.runs.provenance import current_commit, current_provenance, differences
+from sb3_por.runs.provenance import current_provenance
+from sb3_por.runs.versions import current_commit, differences
 from sb3_por.training.zoo import main
 
 FLAGS = ["--algo", "sac", "--env", "Pendulum-v1", "-n", "60", "--eval-freq", "-1", "--num-threads", "1"]
@@ -37,7 +38,7 @@ def test_a_commit_with_changes_is_marked(tmp_path, monkeypatch):
 
     (tmp_path / "a" / "b").mkdir(parents=True)
     (tmp_path / "file").write_text("one")
-    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "a" / "b" / "c.py"))
+    monkeypatch.setattr(versions, "__file__", str(tmp_path / "a" / "b" / "c.py"))
     assert current_commit() == ""
     for words in (("init", "-q"), ("add", "-A"), ("commit", "-q", "-m", "one")):
         git(*words)

@@ -1,15 +1,12 @@
-"""Suites on a Ray cluster: the copy of a run's folder, and a real cluster of two nodes that loses a worker and a node."""
+"""Suites on a Ray cluster: the copy of a run's folder, and a real cluster whose workers, nodes, head and driver are killed."""
 
-import os
 import secrets
-import shutil
 import signal
-import socket
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,13 +14,14 @@ import numpy as np
 import pandas as pd
 import psutil
 import pytest
+from ray_cluster import PATIENCE, RayCluster, wait_for
 from stable_baselines3 import SAC
 
 from sb3_por.__main__ import main
 from sb3_por.evaluation.loading import load_model
 from sb3_por.runs.checkpoints import latest_checkpoint, remove_checkpoints, restore_buffer, save_checkpoint
 from sb3_por.suites.folder_sync import read_changes, write_changes
-from sb3_por.suites.suite_file import Run
+from sb3_por.suites.run import Run
 
 ROOT = Path(__file__).parents[2]
 needs_ray = pytest.mark.skipif(
@@ -138,50 +136,24 @@ hyperparams: {learning_starts: 50, buffer_size: 500, batch_size: 8}
 
 @pytest.fixture
 def cluster(tmp_path):
-    """Address, environment variables, and the processes of a head and of another node, with one CPU each."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    # A token of its own: without one, anybody who reaches the port may run programs. Ray's sockets want a short path.
-    folder = tempfile.mkdtemp(prefix="ray_", dir="/tmp")
-    env = os.environ | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "TMPDIR": folder}
-    env["RAY_worker_niceness"] = "0"  # 15 by default, which on a busy machine takes long
-    command = [
-        sys.executable,
-        "-m",
-        "ray.scripts.scripts",
-        "start",
-        "--block",
-        "--num-cpus=1",
-        "--object-store-memory=80000000",
-    ]
-    head = [f"--port={port}", "--head", "--include-dashboard=false", "--disable-usage-stats", f"--temp-dir={folder}"]
-    nodes = []
-    try:
-        for number, more in enumerate((head, [f"--address=127.0.0.1:{port}"])):
-            log = tmp_path / f"node_{number}.txt"
-            with open(log, "wb") as file:
-                node = subprocess.Popen([*command, *more], env=env, stdout=file, stderr=file, start_new_session=True)
-            nodes.append(node)
-            wait_for(lambda log=log: "Ray runtime started" in log.read_text(), 90)
-        yield f"127.0.0.1:{port}", env, nodes
-    finally:
-        left = [process for node in nodes for process in [*descendants(node), node]]
-        for process in left:
-            process.kill()
-        for process in left:
-            process.wait(10)
-        shutil.rmtree(folder, ignore_errors=True)
+    """A cluster without nodes."""
+    (tmp_path / "nodes").mkdir()
+    cluster = RayCluster(tmp_path / "nodes")
+    yield cluster
+    cluster.close()
 
 
 @pytest.fixture
-def start(cluster):
-    """Starts a program with the environment variables of the cluster; it does not outlive the test."""
+def start(cluster, tmp_path):
+    """Starts the suite of a grid on the cluster; it does not outlive the test."""
     started = []
 
-    def popen(command):
+    def popen(grid, *flags, **variables):
+        (tmp_path / "grid.yml").write_text(grid)
+        words = [sys.executable, "-m", "sb3_por", "suite", tmp_path / "grid.yml", "--root", tmp_path / "runs"]
+        env = {name: value for name, value in (cluster.env | variables).items() if value}
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        started.append(subprocess.Popen(command, cwd=ROOT, env=cluster[1], **pipes))
+        started.append(subprocess.Popen([*words, "--ray", cluster.address, *flags], cwd=ROOT, env=env, **pipes))
         return started[-1]
 
     yield popen
@@ -190,73 +162,161 @@ def start(cluster):
         process.communicate()
 
 
-def descendants(process):
-    try:
-        return psutil.Process(process.pid).children(recursive=True)
-    except psutil.NoSuchProcess:
-        return []
+@pytest.fixture
+def suite_run(tmp_path):
+    return lambda seed: Run(
+        "sac", "Pendulum-v1", seed, tmp_path / "runs" / "grid" / "Pendulum-v1" / "sac" / f"seed_{seed}", ()
+    )
 
 
-def wait_for(condition, seconds):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.1)
+def assert_whole(runs, n_timesteps=300, eval_freq=50):
+    """Every run is finished, with all of its updates and each of its evaluations once."""
+    for run in runs:
+        assert run.state() == "finished", run.log.read_text()
+        assert load_model(run.run_folder / "Pendulum-v1.zip")._n_updates == n_timesteps - 50
+        assert not [path for path in run.folder.rglob("*") if path.name == "checkpoint"]
+    scores = pd.read_csv(runs[0].folder.parents[2] / "scores.csv")
+    steps = list(range(eval_freq, n_timesteps + 1, eval_freq))
+    assert scores.groupby("seed")["step"].apply(list).tolist() == [steps] * len(runs)
 
 
-def training_below(node):
-    """The Ray worker on a node that has a run, and the run's seed."""
-    for process in descendants(node):
-        try:
-            command = process.cmdline()
-            if "sb3_por.zoo" in command and "--seed" in command:
-                return process.parent(), int(command[command.index("--seed") + 1])
-        except psutil.NoSuchProcess:
-            continue
-    return None
+def beginnings(run):
+    """How often a run was begun or resumed, and how often it has done its first evaluation."""
+    log = run.log.read_text()
+    return log.count("Log path:"), log.count("\nStep 50:")
 
 
 @needs_ray
 @pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_a_suite_outlives_a_worker_and_a_node_of_its_cluster(tmp_path, cluster, start):
-    address, _, (head, other) = cluster
-    path, root = tmp_path / "grid.yml", tmp_path / "runs" / "grid"
-    command = [sys.executable, "-m", "sb3_por", "suite", path, "--root", root.parent, "--ray", address]
-
-    path.write_text(GRID + "gpus: 1\n")
-    refused = start(command)
+@pytest.mark.timeout(1800)
+def test_a_suite_outlives_a_worker_and_a_node_and_uses_one_that_joins(cluster, start, suite_run, tmp_path):
+    for name in ("head", "second", "third"):
+        cluster.start(name)
+    refused = start(GRID + "gpus: 1\n")
     assert "no machine of the Ray cluster has 1 CPUs and 1 GPUs" in refused.communicate()[1] and refused.returncode == 2
 
-    path.write_text(GRID)
-    stopped = start([*command, "--root", tmp_path / "stopped"])
-    wait_for(lambda: training_below(head), 240)
-    stopped.terminate()
-    assert "interrupted; the same command resumes it" in stopped.communicate()[1] and stopped.returncode == 130
-    wait_for(lambda: training_below(head) is None and training_below(other) is None, 20)
-
-    suite = start(command)
+    suite = start(GRID.replace("[0, 1, 2]", "[0, 1, 2, 3]"))
     lost = []
-    for node, victim in ((head, "worker"), (other, "node")):
-        wait_for(lambda node=node: training_below(node), 240)
-        worker, seed = training_below(node)
-        run = Run("sac", "Pendulum-v1", seed, root / "Pendulum-v1" / "sac" / f"seed_{seed}", ())
-        wait_for(lambda run=run: latest_checkpoint(run.run_folder), 240)
-        for process in [worker] if victim == "worker" else [*descendants(node), psutil.Process(node.pid)]:
-            process.send_signal(signal.SIGKILL)
+    for name, victim in (("head", "worker"), ("third", "node")):
+        wait_for(lambda name=name: cluster.trainings(name))
+        ((seed, process),) = cluster.trainings(name).items()
+        run = suite_run(seed)
+        wait_for(lambda run=run: latest_checkpoint(run.run_folder))
+        if victim == "worker":
+            process.parent().kill()
+        else:
+            cluster.kill(name)
         lost.append(run)
+    cluster.start("fourth")
+    wait_for(lambda: cluster.trainings("fourth"))
     shown, errors = suite.communicate()
     assert suite.returncode == 0, errors
 
     assert lost[0] != lost[1]
-    for run in lost:
-        log = run.log.read_text()
-        assert log.count("Log path:") == 2 and log.count("\nStep 50:") == 1, "taken up, not begun again"
-    for seed in range(3):
-        run = Run("sac", "Pendulum-v1", seed, root / "Pendulum-v1" / "sac" / f"seed_{seed}", ())
-        assert run.state() == "finished"
-        assert load_model(run.run_folder / "Pendulum-v1.zip")._n_updates == 250
+    assert [beginnings(run) for run in lost] == [(2, 1)] * 2, "taken up, not begun again"
+    assert_whole([suite_run(seed) for seed in range(4)])
     # Ray itself writes to stdout what it has lost.
-    assert shown.splitlines()[-1] == str(root / "scores.csv")
-    scores = pd.read_csv(root / "scores.csv")
-    assert scores.groupby("seed")["step"].apply(list).tolist() == [[50, 100, 150, 200, 250, 300]] * 3
+    assert shown.splitlines()[-1] == str(tmp_path / "runs" / "grid" / "scores.csv")
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_suite_that_ends_takes_its_runs_along_and_is_resumed(cluster, start, suite_run):
+    """SIGTERM, and SIGKILL, to the program that was started by hand."""
+    cluster.start("head", cpus=2)
+    for number, code in ((signal.SIGTERM, 130), (signal.SIGKILL, -9)):
+        suite = start(GRID)
+        wait_for(lambda: len(cluster.trainings()) == 2)
+        wait_for(lambda: any(latest_checkpoint(suite_run(seed).run_folder) for seed in range(3)))
+        suite.send_signal(number)
+        errors = suite.communicate()[1]
+        assert suite.returncode == code, errors
+        assert number == signal.SIGKILL or "interrupted; the same command resumes it" in errors
+        wait_for(lambda: not cluster.trainings(), 60)
+    suite = start(GRID)
+    errors = suite.communicate()[1]
+    assert suite.returncode == 0, errors
+    runs = [suite_run(seed) for seed in range(3)]
+    assert_whole(runs)
+    assert max(map(beginnings, runs))[0] > 1 and {first for _, first in map(beginnings, runs)} == {1}
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_suite_waits_for_a_head_that_is_lost(cluster, start, suite_run):
+    """For longer than the minute after which Ray ends processes that miss it."""
+    for name in ("head", "second"):
+        cluster.start(name)
+    suite = start(GRID)
+    wait_for(lambda: any(latest_checkpoint(suite_run(seed).run_folder) for seed in range(3)))
+    cluster.kill("head")
+    cluster.kill("second")
+    time.sleep(70)
+    assert suite.poll() is None, suite.communicate()[1]
+    cluster.start("head", cpus=2)
+    errors = suite.communicate()[1]
+    assert suite.returncode == 0, errors
+    (note,) = [line for line in errors.splitlines() if line.startswith("note: ")]
+    assert "the Ray cluster is lost" in note and "continue when it is started again at the same address" in note
+    runs = [suite_run(seed) for seed in range(3)]
+    assert_whole(runs)
+    assert {first for _, first in map(beginnings, runs)} == {1}
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_token_is_required_and_versions_that_differ_are_named(cluster, start, suite_run, tmp_path):
+    cluster.start("head")
+    for variables in ({"RAY_AUTH_MODE": "", "RAY_AUTH_TOKEN": ""}, {"RAY_AUTH_TOKEN": secrets.token_hex(32)}):
+        refused = start(GRID, **variables)
+        errors = refused.communicate()[1]
+        assert refused.returncode == 2 and f"error: no Ray cluster at {cluster.address}: " in errors.splitlines()[-1], errors
+        assert "RAY_AUTH_MODE must be the same there and here" in errors
+    stranger = cluster.start_unchecked("stranger", RAY_AUTH_TOKEN=secrets.token_hex(32))
+    assert stranger.wait(PATIENCE) != 0 and "Ray runtime started" not in cluster.log("stranger")
+
+    # As another interpreter would present itself
+    (tmp_path / "python").mkdir()
+    (tmp_path / "python" / "sitecustomize.py").write_text(
+        "import ray._private.utils as utils\nutils.compute_version_info = lambda: (utils.ray.__version__, '3.10.1')\n"
+    )
+    refused = start(GRID, PYTHONPATH=f"{tmp_path / 'python'}:{ROOT}")
+    errors = refused.communicate()[1]
+    assert refused.returncode == 2 and "install the same versions as on the Ray cluster" in errors, errors
+    assert "Python: 3.10.1" in errors
+
+    # A machine with another version of a package, as its metadata say
+    package = tmp_path / "packages" / "gymnasium-0.0.1.dist-info"
+    package.mkdir(parents=True)
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: gymnasium\nVersion: 0.0.1\n")
+    cluster.kill("head")
+    cluster.start("head", PYTHONPATH=f"{package.parent}:{ROOT}")
+    suite = start(GRID.replace("[0, 1, 2]", "[0]"))
+    errors = suite.communicate()[1]
+    assert suite.returncode == 0, errors
+    assert f"has gymnasium 0.0.1 instead of {version('gymnasium')}: its numbers may differ" in errors
+    assert errors.count("its numbers may differ") == 1
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@pytest.mark.skipif(psutil.virtual_memory().available < 20 * 2**30, reason="50 runs at a time need 20 GiB")
+def test_two_hundred_runs_at_fifty_at_a_time_are_done_once(cluster, start, suite_run, tmp_path):
+    for name, cpus in (("head", 20), ("second", 15), ("third", 15)):
+        cluster.start(name, cpus)
+    short = GRID.replace("n_timesteps: 300", "n_timesteps: 60").replace("save_freq: 50", "save_freq: 40")
+    suite = start(short.replace("[0, 1, 2]", str(list(range(200)))))
+    most = 0
+    while suite.poll() is None:
+        most = max(most, len(cluster.trainings()))
+        time.sleep(1)
+    errors = suite.communicate()[1]
+    assert suite.returncode == 0, errors
+    runs = [suite_run(seed) for seed in range(200)]
+    assert_whole(runs, 60)
+    assert {beginnings(run) for run in runs} == {(1, 1)}
+    assert 40 < most <= 50

@@ -54,6 +54,7 @@ from sb3_por.runs.origin import mark_as_own, note_foreign
 from sb3_por.training.checks import check_policy, check_settings
 from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
 from sb3_por.training.full_disk import PatientLogs, keep_playing
+from sb3_por.training.saved_state import check_saved_state
 from sb3_por.training.trials import trial_settings
 from sb3_por.training.workers import WorkerProcesses
 from sb3_por.visual.algorithm import VisualAlgorithm
@@ -109,6 +110,8 @@ class Experiment(ExperimentManager):
 
     def create_log_folder(self) -> None:
         """Make the folder at once; the zoo makes it later, so that runs started together would share it."""
+        if self.trained_agent:
+            note_foreign(Path(self.trained_agent))  # before anything in its folder is unpickled
         while self._resumed_run is None:
             run_id = get_latest_run_id(self.log_path, self.env_name) + 1
             self.save_path = os.path.join(self.log_path, f"{self.env_name}_{run_id}{self._uuid}")
@@ -223,9 +226,9 @@ class Experiment(ExperimentManager):
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         """Restore the replay buffer of a checkpoint, too, and draw other scenes than at the beginning of the run."""
-        note_foreign(Path(self.trained_agent))
         with quiet_n_steps():
             model = super()._load_pretrained_agent(hyperparams, env)
+        check_saved_state(Path(self.trained_agent), model)
         model.policy.set_training_mode(True)  # a policy that this algorithm cannot train says so now
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)

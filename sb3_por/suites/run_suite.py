@@ -17,7 +17,7 @@ from rich.table import Column, Table
 
 from sb3_por.analysis.scores import read_scores, write_csv
 from sb3_por.common.errors import UserNote
-from sb3_por.common.files import check_writable
+from sb3_por.common.files import check_writable, disk_errors
 from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, read_settings
 from sb3_por.runs.lock import lock_folder
 from sb3_por.suites.cluster import outlive
@@ -73,12 +73,14 @@ def _do_on_cluster(suite: Suite, runs: list[Run], address: str, folder: Path, re
 
 def _do(pool: Pool, folder: Path) -> int:
     console = Console(stderr=True)
-    with _interruptible():
-        _show_work(pool, console)
-    console.print(progress_table(pool))
-    if any(run.run_folder.joinpath(EVALUATIONS).exists() for run in pool.runs):
-        write_csv(read_scores([folder]), folder / "scores.csv")
-        print(folder / "scores.csv")
+    scores = folder / "scores.csv"
+    with disk_errors(scores):
+        with _interruptible():
+            _show_work(pool, console)
+        console.print(progress_table(pool))
+        if any(run.run_folder.joinpath(EVALUATIONS).exists() for run in pool.runs):
+            write_csv(read_scores([folder]), scores)
+            print(scores)
     return _name_failed(pool)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import psutil
 import pytest
+from disks import make_read_only, small_disk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
@@ -284,6 +285,27 @@ def test_an_asked_for_stop_leaves_runs_that_go_on(start_suite, tmp_path, capfd):
     assert process.exitcode == 0
     shown = capfd.readouterr().err
     assert "running      Pendulum-v1/sac/seed_0" in shown and "3 of 3 runs finished" in shown
+
+
+def test_a_disk_that_becomes_read_only_ends_a_suite_in_one_line_and_loses_nothing(start_suite, tmp_path, capfd):
+    with small_disk(tmp_path / "runs") as disk:
+        process = start_suite(FAKE_SUITE)
+        wait_for(lambda: checkpoints_of(disk))
+        make_read_only(disk)
+        process.join()
+        shown = capfd.readouterr().err
+        assert process.exitcode == 2 and "Traceback" not in shown
+        assert f"cannot write {disk}/grid/scores.csv: Read-only file system" in shown.splitlines()[-1]
+        subprocess.run(["umount", "--lazy", disk], check=True)  # what made it read-only
+        before = checkpoints_of(disk)
+        assert before
+        process = start_suite(FAKE_SUITE)
+        process.join()
+        assert process.exitcode == 0
+        for checkpoint in before:
+            log = (checkpoint.parents[3] / "log.txt").read_text().splitlines()
+            steps = [int(line.split()[0]) for line in log if line.split()[0].isdigit()]
+            assert sorted(set(steps)) == list(range(1, 11)) and len(steps) <= 11, "taken up, not begun again"
 
 
 def test_failed_runs_are_listed_with_the_end_of_their_logs(suite_file, tmp_path, fake_training, capfd):

@@ -33,6 +33,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_por.evaluation.environment import make_evaluation_env
 from sb3_por.evaluation.loading import resolve
+from sb3_por.evaluation.model_files import model_file
 from sb3_por.runs.facts import run_identity
 from softbody_envs import ENV_IDS
 from softbody_envs.env import OBS_TYPES
@@ -163,6 +164,7 @@ def plays(n_workers: int, models: list[Path]) -> list[tuple[str, str, str, Calla
         if has_expert(env_id):
             found += [(env_id, "expert", kind, partial(make_scripted, env_id, kind)) for kind in ("state", "dict")]
     for path in models:
+        model_file(path)  # one that is missing is told before the first round
         env_id = run_identity(path)["env"]
         found.append((env_id, "trained", "its own", partial(make_trained, env_id, path)))
     return found

@@ -18,7 +18,7 @@ from sb3_por.runs.folder import run_arguments
 #: Seconds for what takes a few on a quiet machine
 PATIENCE = 300
 #: How often a node is started that does not join
-ATTEMPTS = 5
+ATTEMPTS = 8
 #: Ports of a node that it would else choose itself, and wait for, 15 s at most, until its agents have written them
 AGENTS = ("dashboard-agent-listen-port", "dashboard-agent-grpc-port", "metrics-export-port", "runtime-env-agent-port")
 

@@ -1,5 +1,6 @@
 """What is quick stays quick: help and errors do not wait for PyTorch."""
 
+import ast
 import configparser
 import subprocess
 import sys
@@ -35,6 +36,19 @@ def test_errors_can_be_imported_without_torch():
     script = f"import sys, sb3_por.common.errors; print([name for name in {SLOW} if name in sys.modules])"
     shown = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert shown.strip() == "[]"
+
+
+def test_a_worker_of_a_cluster_does_not_wait_for_torch():
+    """What ``suites/ray_task.py`` imports besides Ray."""
+    imported = set()
+    for node in ast.walk(ast.parse((ROOT / "sb3_por" / "suites" / "ray_task.py").read_text())):
+        if isinstance(node, ast.ImportFrom):
+            imported.add(node.module)
+    own = sorted(name for name in imported if name.startswith("sb3_por"))
+    slow = ("torch", "stable_baselines3", "matplotlib", "pandas", "gymnasium")
+    script = f"import sys, {', '.join(own)}; print([name for name in {slow} if name in sys.modules])"
+    shown = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert len(own) >= 3 and shown.strip() == "[]"
 
 
 def test_public_names_are_what_they_name():

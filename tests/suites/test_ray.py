@@ -299,24 +299,3 @@ def test_a_token_is_required_and_versions_that_differ_are_named(cluster, start, 
     assert suite.returncode == 0, errors
     assert f"has gymnasium 0.0.1 instead of {version('gymnasium')}: its numbers may differ" in errors
     assert errors.count("its numbers may differ") == 1
-
-
-@needs_ray
-@pytest.mark.slow
-@pytest.mark.timeout(7200)
-@pytest.mark.skipif(psutil.virtual_memory().available < 20 * 2**30, reason="50 runs at a time need 20 GiB")
-def test_two_hundred_runs_at_fifty_at_a_time_are_done_once(cluster, start, suite_run, tmp_path):
-    for name, cpus in (("head", 20), ("second", 15), ("third", 15)):
-        cluster.start(name, cpus)
-    short = GRID.replace("n_timesteps: 300", "n_timesteps: 60").replace("save_freq: 50", "save_freq: 40")
-    suite = start(short.replace("[0, 1, 2]", str(list(range(200)))))
-    most = 0
-    while suite.poll() is None:
-        most = max(most, len(cluster.trainings()))
-        time.sleep(1)
-    errors = suite.communicate()[1]
-    assert suite.returncode == 0, errors
-    runs = [suite_run(seed) for seed in range(200)]
-    assert_whole(runs, 60)
-    assert {beginnings(run) for run in runs} == {(1, 1)}
-    assert 40 < most <= 50

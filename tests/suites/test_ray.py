@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import psutil
 import pytest
 from ray_cluster import PATIENCE, RayCluster, wait_for
 from stable_baselines3 import SAC

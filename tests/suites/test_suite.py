@@ -183,7 +183,7 @@ if algo == "ppo":
 checkpoint = f"{run}/checkpoint"
 os.makedirs(checkpoint, exist_ok=True)
 begin = max([0, *(int(name[5:]) for name in os.listdir(checkpoint))])
-with open(f"{run}/0.monitor.csv", "a") as monitor:
+with open(f"{run}/0.monitor.csv", "a" if begin else "w") as monitor:
     for step in range(begin + 1, 11):
         time.sleep(0.2)
         print(step, os.getpid(), flush=True)

@@ -1,5 +1,6 @@
 """Facts about runs besides their scores: identity, state, progress, settings, machine, and the end of their logs."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ from sb3_por.runs.folder import (
 )
 from sb3_por.runs.lock import is_locked
 
+#: The wrapper whose steps hold several control steps, as settings name it.
+ACTION_REPEAT = "softbody_envs.wrappers.ActionRepeat"
 #: Lines of a log that are kept.
 LOG_LINES = 15
 #: Arguments of train.py that belong to a run's settings; the others say where files are and how the search is done.
@@ -107,10 +110,10 @@ def progress(run: Path) -> tuple[int, float | None]:
     """
     :return: steps that the run has done, to the last episode's end, and its latest mean normalized performance
     """
-    steps = 0
+    steps, repeat = 0, _action_repeat(run)
     for monitor in run.glob(MONITORS):
         rows = (line.split(",") for line in monitor.read_text().splitlines()[2:])
-        steps += sum(int(row[1]) for row in rows if len(row) > 2)
+        steps += sum(math.ceil(int(row[1]) / repeat) for row in rows if len(row) > 2)
     score = None
     if (run / EVALUATIONS).is_file():
         arrays = read_evaluations(run)
@@ -118,6 +121,14 @@ def progress(run: Path) -> tuple[int, float | None]:
         latest = float(np.mean(arrays.get("normalized_performance", np.full((1, 1), np.nan))[-1]))
         score = None if np.isnan(latest) else latest
     return steps, score
+
+
+def _action_repeat(run: Path) -> int:
+    """Control steps of an agent's step: the monitors are inside ``ActionRepeat``, and count the former."""
+    wrappers = read_settings(run / run_identity(run)["env"] / HYPERPARAMETERS).get("env_wrapper")
+    entries = wrappers if isinstance(wrappers, list) else [wrappers]
+    held = [entry[ACTION_REPEAT] for entry in entries if isinstance(entry, dict) and ACTION_REPEAT in entry]
+    return math.prod(int(arguments["repeat"]) for arguments in held)
 
 
 def run_identity(run: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from sb3_por.analysis.report import write_report
 from sb3_por.analysis.scores import read_scores, write_csv
 from sb3_por.analysis.statistics import aggregates, improvements
 from sb3_por.common.errors import UserError
-from sb3_por.runs.facts import take_inventory
+from sb3_por.runs.facts import progress, take_inventory
 
 ENV = "FallingBall-v0"
 PERFORMANCE = {"sac_por": (0.1, 0.5, 0.9), "sac": (0.2, 0.3, 0.6)}
@@ -200,3 +200,12 @@ def test_a_browser_shows_every_picture_and_loads_nothing(page, tmp_path):
     seen = json.loads(re.search("<title>(.*?)</title>", done.stdout).group(1))
     assert len(seen["sizes"]) == len(page.images) and min(seen["sizes"]) > 100
     assert seen["loaded"] == [] and seen["overflow"] <= 0
+
+
+def test_steps_of_held_actions_are_the_agents(tmp_path):
+    run = write_run(tmp_path, steps=[100, 200, 300])
+    (run / "0.monitor.csv").write_text("#{}\nr,l,t\n" + "1.0,102,1.0\n" * 80)
+    assert progress(run)[0] == 8160
+    wrappers = [{"softbody_envs.wrappers.ActionRepeat": {"repeat": 5}}, "gymnasium.wrappers.RescaleAction"]
+    (run / "PourWater-v0" / "config.yml").write_text(yaml.safe_dump({"env_wrapper": wrappers}))
+    assert progress(run)[0] == 80 * 21

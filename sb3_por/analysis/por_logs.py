@@ -63,10 +63,11 @@ def read_order_of(run: Path) -> pd.DataFrame:
     :return: its rows; none if it has logged no POR loss
     :raises NoLogs: if it has no TensorBoard files
     """
-    events: dict[str, list[tuple[float, int, float]]] = {metric: [] for metric in LOGGED_METRICS}
-    for log in _logs_of(run):
+    events: dict[str, list[tuple[int, float]]] = {metric: [] for metric in LOGGED_METRICS}
+    logs = [log for log in _logs_of(run) if log.Tags()["scalars"]]
+    for log in sorted(logs, key=lambda log: log.FirstEventTimestamp()):
         for metric in set(LOGGED_METRICS) & {tag.removeprefix("train/") for tag in log.Tags()["scalars"]}:
-            events[metric] += [(event.wall_time, event.step, event.value) for event in log.Scalars(f"train/{metric}")]
+            events[metric] += [(event.step, event.value) for event in log.Scalars(f"train/{metric}")]
     if not events["por_loss"]:
         events = {metric: [] for metric in LOGGED_METRICS}  # other objectives log gradient norms, too
     columns = {metric: _latest(logged) for metric, logged in events.items()}
@@ -136,11 +137,14 @@ def _agrees(log: EventAccumulator, evaluations: dict[int, float]) -> bool:
     return bool(logged) and np.allclose(list(logged.values()), own, rtol=1e-5)  # TensorBoard keeps float32
 
 
-def _latest(events: list[tuple[float, int, float]]) -> pd.Series:
-    """Values by step. A resumed run logs again what was logged after its checkpoint: the latest value counts."""
+def _latest(events: list[tuple[int, float]]) -> pd.Series:
+    """
+    Values by step, from events in the order in which they were written. A resumed run logs again what was logged after its
+    checkpoint: the latest value counts. Times of events would not tell, since clocks jump.
+    """
     kept: dict[int, float] = {}
     earliest = math.inf
-    for _, step, value in sorted(events, reverse=True):
+    for step, value in reversed(events):
         if step < earliest:
             kept[step], earliest = value, step
     return pd.Series(kept, dtype=float).sort_index()

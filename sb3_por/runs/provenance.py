@@ -35,7 +35,7 @@ def current_provenance(threads: int) -> dict[str, Any]:
     Everything that decides whether a run gives the same numbers again, to the last bit: see ``docs/reliability.md``.
 
     :param threads: PyTorch threads of the run; those of this process if not positive
-    :return: Plain values by name: those of :func:`~sb3_por.runs.versions.current_versions`, ``processor``, its vector
+    :return: Plain values by name: those of :func:`sb3_por.runs.versions.current_versions`, ``processor``, its vector
         instructions (``cpu_flags``), those that PyTorch uses (``cpu_capability``), ``threads``, ``accelerator``, and each of
         ``VARIABLES`` that is set
     """

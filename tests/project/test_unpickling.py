@@ -19,8 +19,8 @@ RUN = {
     *("read_pickle", "load_from_pkl", "load_replay_buffer", "_load_pretrained_agent", "json_to_data"),
     *("unsafe_load", "unsafe_load_all", "full_load", "full_load_all"),
 }
-#: Methods called ``load`` that read plain values
-PLAIN = {"json"}
+#: Methods called ``load`` that read plain values; a ranker's file holds arrays and JSON
+PLAIN = {"json", "Ranker"}
 
 #: Place: who told it to
 TOLD = {

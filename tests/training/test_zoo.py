@@ -148,6 +148,7 @@ def test_runs_started_together_get_folders_of_their_own(tmp_path, monkeypatch):
     for experiment in experiments:
         experiment.log_path, experiment.env_name, experiment._uuid = str(tmp_path), "E-v0", ""
         experiment.tensorboard_log, experiment.optimize_hyperparameters, experiment._resumed_run = None, False, None
+        experiment.trained_agent = ""
         experiment.create_log_folder()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["E-v0_1", "E-v0_2"]
     assert experiments[1].tensorboard_log == str(tmp_path / "E-v0_2" / "tb")

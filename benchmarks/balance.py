@@ -10,15 +10,17 @@ as the reward). No agent acts: this measures who trains the encoder, not what is
 import argparse
 import csv
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
+import yaml
 from stable_baselines3.common.logger import Logger
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import SACPOR
 from softbody_envs.wrappers import ActionRepeat, ProgressReward
 
+ENV = "PourWater-v0"
+SETTINGS = Path(__file__).parents[1] / "zoo_hyperparams" / "sac_por.yml"
 COEFS: tuple[str | float, ...] = (0.0, 1.0, 100.0, "auto_0.1", "auto_0.3")
 #: Updates between two rows of the table; each is a mean over them
 INTERVAL = 50
@@ -33,22 +35,10 @@ def make_model(env: gym.Env, por_coef: str | float, seed: int, n_frames: int) ->
     """
     :return: A model with the settings of ``zoo_hyperparams/sac_por.yml``, without a frame
     """
-    settings: dict[str, Any] = dict(
-        learning_rate=7e-4,
-        batch_size=64,
-        buffer_size=n_frames,
-        learning_starts=n_frames,
-        ent_coef="auto_0.1",
-        tau=0.01,
-        gamma=0.9,
-        target_update_interval=2,
-        actor_update_interval=2,
-        ent_coef_lr_ratio=10.0,
-        reward_scale=2.0,
-        diagnostics_interval=5,
-        policy_kwargs=dict(features_extractor_kwargs=dict(strides=[4, 2, 1], n_filters=16)),
-    )
-    return SACPOR("CnnPolicy", env, por_coef=por_coef, seed=seed, device="cpu", **settings)
+    of_run = {"n_timesteps", "env_kwargs", "env_wrapper", "gradient_steps"}
+    settings = {name: value for name, value in yaml.safe_load(SETTINGS.read_text())[ENV].items() if name not in of_run}
+    settings |= {"por_coef": por_coef, "buffer_size": n_frames, "learning_starts": n_frames, "diagnostics_interval": 5}
+    return SACPOR(env=env, seed=seed, device="cpu", **settings)
 
 
 def follow(model: SACPOR, n_updates: int) -> list[tuple[float, ...]]:
@@ -74,7 +64,7 @@ def main() -> None:
     parser.add_argument("--image-size", type=int, default=64)
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
-    env = ProgressReward(ActionRepeat(gym.make("PourWater-v0", image_size=arguments.image_size), repeat=10, scale=0.7))
+    env = ProgressReward(ActionRepeat(gym.make(ENV, image_size=arguments.image_size), repeat=10, scale=0.7))
     played = make_model(env, 0.0, arguments.seed, arguments.frames).learn(arguments.frames)
     rows = []
     for coef in COEFS:

@@ -140,15 +140,15 @@ def _take_evaluations(archive: Path, run: Path) -> None:
         return
     try:
         with zipfile.ZipFile(archive) as metrics:
-            if files.EVALUATIONS in metrics.namelist() and metrics.getinfo(files.EVALUATIONS).file_size <= MAX_FILE:
-                evaluations = metrics.read(files.EVALUATIONS)
-            else:
-                return
+            names = metrics.namelist()
+            small = files.EVALUATIONS in names and metrics.getinfo(files.EVALUATIONS).file_size <= MAX_FILE
+            evaluations = metrics.read(files.EVALUATIONS) if small else None
     # Whatever a damaged archive makes zipfile raise
     except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, EOFError) as error:
         warnings.warn(f"cannot read {archive.name}, so there are no evaluations to plot: {one_line(error)}", UserNote)
         return
-    (run / files.EVALUATIONS).write_bytes(evaluations)
+    if evaluations is not None:
+        (run / files.EVALUATIONS).write_bytes(evaluations)
 
 
 def _settings(path: Path) -> dict[str, Any]:

@@ -21,12 +21,12 @@ from sb3_por.common.errors import UserError, UserNote, check_known, one_line
 from sb3_por.common.files import check_writable
 from sb3_por.common.shipped import shipped
 from sb3_por.evaluation.loading import find_environment, import_packages, model_file, read_data
+from sb3_por.ranking.ranker import Ranker
 from sb3_por.runs.checkpoints import (
     latest_checkpoint,
     remove_checkpoints,
 )
 from sb3_por.runs.folder import ARGUMENTS, import_names, last_model, run_arguments, the_run
-from sb3_por.ranking.ranker import Ranker
 from sb3_por.runs.provenance import current_machine, current_provenance
 from sb3_por.runs.versions import current_commit, differences
 

@@ -21,6 +21,7 @@ LAYERS = (
     "analysis",
     "sharing",
     "suites",
+    "commands",
 )
 FILES = [*ROOT.glob("sb3_por/*/*.py"), *ROOT.glob("softbody_envs/**/*.py")]
 

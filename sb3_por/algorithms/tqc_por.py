@@ -56,7 +56,6 @@ class TQCPOR(VisualTQC):
         control, draws the order of swapped pairs by chance
     :param order_head: The classifier c: ``"mlp"`` (the paper's), ``"difference"`` or ``"coordinatewise"``
     :param order_dim: Size m of the physical quantities; half the encoder's features by default
-    :param order_hidden_dim: Size of the hidden layers of g and c
     :param k: Steps between the two frames of a pair
     :param random_k: Draw the steps of each pair from 1..k
     :param encoder_tau: Soft update coefficient of the momentum encoder; ``encoder_tau_ratio`` times ``tau`` by default: the
@@ -121,7 +120,6 @@ class TQCPOR(VisualTQC):
         pairing: str = "swap",
         order_head: str = "mlp",
         order_dim: int | None = None,
-        order_hidden_dim: int = 256,
         k: int = 1,
         random_k: bool = False,
         encoder_tau: float | None = None,
@@ -143,7 +141,6 @@ class TQCPOR(VisualTQC):
         self.pairing = pairing
         self.order_head = order_head
         self.order_dim = order_dim
-        self.order_hidden_dim = order_hidden_dim
         self.k = k
         self.random_k = random_k
         super().__init__(

@@ -7,6 +7,8 @@ from sb3_por.objectives.base import EncodedBatch, Objective, mlp
 from sb3_por.objectives.order_heads import ORDER_HEADS
 
 PAIRINGS = ("paper", "swap", "sham")
+#: Size of the hidden layers of g and c
+HIDDEN_DIM = 256
 
 
 class PartialOrder(Objective):
@@ -29,7 +31,6 @@ class PartialOrder(Objective):
     :param pairing: ``"paper"``, ``"swap"`` or ``"sham"``
     :param order_head: The classifier c: ``"mlp"`` (the paper's), ``"difference"`` or ``"coordinatewise"``
     :param order_dim: Size m < n of the physical quantities x; n // 2 by default
-    :param order_hidden_dim: Size of the hidden layers of g and c
     :param k: Distance of the two frames; k = 1 in the paper
     :param random_k: Draw the distance of each pair from 1..k
     """
@@ -43,7 +44,6 @@ class PartialOrder(Objective):
         pairing: str = "swap",
         order_head: str = "mlp",
         order_dim: int | None = None,
-        order_hidden_dim: int = 256,
         k: int = 1,
         random_k: bool = False,
     ):
@@ -62,8 +62,8 @@ class PartialOrder(Objective):
         self.pairing = pairing
         self.future = (1 if random_k else k, k)
         self.past = None if pairing == "paper" else self.future
-        self.g = mlp(features_dim, order_hidden_dim, order_dim)
-        self.c = ORDER_HEADS[order_head](order_dim, order_hidden_dim)
+        self.g = mlp(features_dim, HIDDEN_DIM, order_dim)
+        self.c = ORDER_HEADS[order_head](order_dim, HIDDEN_DIM)
 
     def loss(self, batch: EncodedBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """

@@ -19,11 +19,10 @@ class Projection(nn.Module):
 
     :param block_dims: Size of each block of the trunk's output
     :param features_dim: Size of one projected block
-    :param tanh: Squash the features into [-1, 1], as DrQ does and CURL does not
     :param n_positions: Number of leading features that are not projected
     """
 
-    def __init__(self, block_dims: Sequence[int], features_dim: int, tanh: bool = True, n_positions: int = 0):
+    def __init__(self, block_dims: Sequence[int], features_dim: int, n_positions: int = 0):
         super().__init__()
         self.block_dims = list(block_dims)
         self.n_positions = n_positions
@@ -32,7 +31,7 @@ class Projection(nn.Module):
             linear = nn.Linear(block_dim, features_dim)
             nn.init.orthogonal_(linear.weight)
             nn.init.zeros_(linear.bias)
-            self.blocks.append(nn.Sequential(linear, nn.LayerNorm(features_dim), nn.Tanh() if tanh else nn.Identity()))
+            self.blocks.append(nn.Sequential(linear, nn.LayerNorm(features_dim), nn.Tanh()))
 
     def forward(self, trunk_features: th.Tensor) -> th.Tensor:
         positions, *blocks = trunk_features.split([self.n_positions, *self.block_dims], dim=1)
@@ -50,24 +49,20 @@ class Encoder(BaseFeaturesExtractor):
     :param observation_space: Observation space
     :param block_dims: Size of each block of the trunk's output
     :param features_dim: Size of one projected block
-    :param tanh: Squash the projected features into [-1, 1]
     :param n_positions: Number of leading features that are not projected
     """
 
-    def __init__(
-        self, observation_space: gym.Space, block_dims: Sequence[int], features_dim: int, tanh: bool, n_positions: int = 0
-    ):
+    def __init__(self, observation_space: gym.Space, block_dims: Sequence[int], features_dim: int, n_positions: int = 0):
         super().__init__(observation_space, n_positions + features_dim * len(block_dims))
         self.block_dims = list(block_dims)
         self.block_features_dim = features_dim
-        self.tanh = tanh
         self.n_positions = n_positions
 
     def make_projection(self) -> nn.Module:
         """
         :return: A new projection from the trunk's output to ``features_dim`` features
         """
-        return Projection(self.block_dims, self.block_features_dim, self.tanh, self.n_positions)
+        return Projection(self.block_dims, self.block_features_dim, self.n_positions)
 
 
 def make_projection(features_extractor: nn.Module) -> nn.Module:
@@ -192,7 +187,7 @@ def make_conv_trunk(
 
 class ConvEncoder(Encoder):
     """
-    The convolutional encoder of CURL and DrQ: 3x3 convolutions, then Linear -> 50 -> LayerNorm (-> tanh). With
+    The convolutional encoder of CURL and DrQ: 3x3 convolutions, then Linear -> 50 -> LayerNorm -> tanh, as in DrQ. With
     ``spatial_softmax`` the features are positions in the image, without a projection; they locate small objects after fewer
     updates.
 
@@ -201,7 +196,6 @@ class ConvEncoder(Encoder):
     :param n_filters: Filters of each convolution
     :param strides: Stride of each convolution. (2, 1, 1, 1) in CURL, DrQ and at the paper's scale;
         the default costs a sixth of it and suits a laptop
-    :param tanh: Squash the projected features into [-1, 1]
     :param center: Subtract one half from the images, which are in [0, 1] then
     :param spatial_softmax: Use the positions of the last convolution's responses as features (``SpatialSoftmax``)
     :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
@@ -213,7 +207,6 @@ class ConvEncoder(Encoder):
         features_dim: int = 50,
         n_filters: int = 32,
         strides: Sequence[int] = (2, 2, 2, 1),
-        tanh: bool = True,
         center: bool = False,
         spatial_softmax: bool = False,
         normalized_image: bool = False,
@@ -228,7 +221,7 @@ class ConvEncoder(Encoder):
         assert observation_space.shape is not None
         trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides, center, spatial_softmax)
         block_dims, n_positions = ([], trunk_dim) if spatial_softmax else ([trunk_dim], 0)
-        super().__init__(observation_space, block_dims, features_dim, tanh, n_positions)
+        super().__init__(observation_space, block_dims, features_dim, n_positions)
         self.trunk = trunk
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
@@ -251,11 +244,10 @@ class VectorEncoder(Encoder):
     :param observation_space: Observation space
     :param features_dim: Size of the projected features
     :param hidden_dim: Size of the hidden layer
-    :param tanh: Squash the projected features into [-1, 1]
     """
 
-    def __init__(self, observation_space: gym.Space, features_dim: int = 50, hidden_dim: int = 256, tanh: bool = True):
-        super().__init__(observation_space, [hidden_dim], features_dim, tanh)
+    def __init__(self, observation_space: gym.Space, features_dim: int = 50, hidden_dim: int = 256):
+        super().__init__(observation_space, [hidden_dim], features_dim)
         self.trunk = make_vector_trunk(get_flattened_obs_dim(observation_space), hidden_dim)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
@@ -272,7 +264,6 @@ class CombinedEncoder(Encoder):
     :param n_filters: Filters of each convolution
     :param strides: Stride of each convolution, see ``ConvEncoder``
     :param hidden_dim: Size of the hidden layer for vectors
-    :param tanh: Squash the projected features into [-1, 1]
     :param center: Subtract one half from the images, which are in [0, 1] then
     :param spatial_softmax: Positions instead of blocks for images, see ``ConvEncoder``
     :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
@@ -285,7 +276,6 @@ class CombinedEncoder(Encoder):
         n_filters: int = 32,
         strides: Sequence[int] = (2, 2, 2, 1),
         hidden_dim: int = 256,
-        tanh: bool = True,
         center: bool = False,
         spatial_softmax: bool = False,
         normalized_image: bool = False,
@@ -305,7 +295,7 @@ class CombinedEncoder(Encoder):
         if vector_dim > 0:
             block_dims.append(hidden_dim)
 
-        super().__init__(observation_space, block_dims, cnn_output_dim, tanh, n_positions)
+        super().__init__(observation_space, block_dims, cnn_output_dim, n_positions)
         self.vector_keys = vector_keys
         # A list, not a ModuleDict, whose keys may not be named "keys" or hold a point
         self.image_keys = list(trunks)

@@ -124,7 +124,7 @@ def test_sham_pairs_are_those_of_swap_in_an_order_drawn_by_chance():
 @pytest.mark.parametrize("order_head", ["mlp", "difference", "coordinatewise"])
 def test_learns_an_order_and_a_potential_that_follows_it(order_head):
     th.manual_seed(0)
-    objective = PartialOrder(FEATURES_DIM, 1, order_head=order_head, order_hidden_dim=32)
+    objective = PartialOrder(FEATURES_DIM, 1, order_head=order_head)
     optimizer = th.optim.Adam(objective.parameters(), lr=3e-3)
     for _ in range(300):
         features = th.randn(64, FEATURES_DIM)
@@ -146,7 +146,7 @@ def train_on_frames_without_time(pairing):
     th.manual_seed(0)
     f_o, f_m = TinyEncoder(), TinyEncoder().requires_grad_(False)
     f_m.load_state_dict(f_o.state_dict())
-    objective = PartialOrder(FEATURES_DIM, 1, pairing=pairing, order_hidden_dim=32)
+    objective = PartialOrder(FEATURES_DIM, 1, pairing=pairing)
     optimizer = th.optim.Adam([*f_o.parameters(), *objective.parameters()], lr=1e-3)
 
     def encode(present, future, past):

@@ -4,6 +4,7 @@ import argparse
 import importlib.util
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch as th
 from torch import nn
@@ -20,7 +21,7 @@ def load(name):
     return module
 
 
-balance, encoders, learner = load("balance"), load("encoders"), load("learner")
+balance, encoders, learner, time_to_score = (load(name) for name in ("balance", "encoders", "learner", "time_to_score"))
 
 
 @pytest.mark.parametrize("name", learner.ALGORITHMS)
@@ -74,3 +75,17 @@ def test_gradients_are_followed_under_each_kind_of_weight(monkeypatch):
         if coef != "auto_0.1":
             assert {row["por_coef"] for row in rows} == {coef}
     assert ratios[0.0] == 0.0 and ratios[100.0] > 10 * ratios["auto_0.1"] > 0.5
+
+
+def test_the_time_to_a_score_is_that_of_the_first_evaluation_with_it():
+    def run(env, seed, *scores):
+        steps, seconds = [100 * i for i in range(1, 4)], [60.0 * i for i in range(1, 4)]
+        columns = {"step": steps, "normalized_performance": scores, "wall_clock_s": seconds}
+        return pd.DataFrame({"env": env, "algo": "sac_por", "seed": seed, **columns}).sample(frac=1, random_state=0)
+
+    scores = pd.concat(
+        [run("PourWater-v0", 0, 0.1, 0.8, 0.2), run("PourWater-v0", 1, 0.1, 0.7, 0.79), run("Own-v0", 0, 1, 1, 1)]
+    )
+    times = time_to_score.time_to_score(scores).set_index("seed")
+    assert times.loc[0, ["env", "wanted", "step", "minutes"]].tolist() == ["PourWater-v0", 0.8, 200, 2]
+    assert times.loc[1, ["step", "minutes"]].isna().all() and len(times) == 2

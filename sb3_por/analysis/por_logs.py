@@ -152,7 +152,7 @@ def _latest(events: list[tuple[int, float]]) -> pd.Series:
 
 def _read_csv(path: Path) -> pd.DataFrame:
     try:
-        order = pd.read_csv(path, dtype={"env": str, "algo": str})
+        order = pd.read_csv(path, dtype={"env": str, "algo": str}, float_precision="round_trip")
     except (OSError, ValueError) as error:
         raise UserError(f"cannot read {path}: {one_line(error)}") from error
     missing = [column for column in [*RUN_KEYS, "step", "por_loss"] if column not in order]

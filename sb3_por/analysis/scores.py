@@ -86,7 +86,9 @@ def read_csv(path: Path) -> pd.DataFrame:
     :raises UserError: if it cannot be read or lacks a column
     """
     try:
-        scores = pd.read_csv(path, dtype={"env": str, "algo": str, "commit": str}, keep_default_na=True)
+        # Pandas' faster way changes last digits, and with them the lines of a table that is written again
+        text = {"env": str, "algo": str, "commit": str}
+        scores = pd.read_csv(path, dtype=text, float_precision="round_trip")
     except (OSError, ValueError) as error:
         raise UserError(f"cannot read {path}: {one_line(error)}") from error
     missing = [column for column in [*RUN_KEYS, "step"] if column not in scores]

@@ -49,11 +49,11 @@ def test_evaluations_of_sb3_itself_have_no_normalized_performance(tmp_path):
 
 def test_a_table_written_and_read_is_the_same_table(tmp_path):
     write_run(tmp_path, seed=1)
-    write_run(tmp_path, algo="sac", seed=2, performance=(0.0, np.nan, 1 / 3))
+    write_run(tmp_path, algo="sac", seed=2, performance=(0.0, np.nan, 0.027327462838349127))
     scores = read_scores([tmp_path])
     write_csv(scores, tmp_path / "scores.csv")
     assert (tmp_path / "scores.csv").read_text().splitlines()[0] == ",".join(COLUMNS)
-    pd.testing.assert_frame_equal(read_csv(tmp_path / "scores.csv"), scores)
+    pd.testing.assert_frame_equal(read_csv(tmp_path / "scores.csv"), scores, check_exact=True)
     pd.testing.assert_frame_equal(read_scores([tmp_path / "scores.csv"]), scores)
 
 

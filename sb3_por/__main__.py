@@ -1,4 +1,4 @@
-"""``python -m sb3_por``: what there is to do with runs and models."""
+"""Do something with runs and models. To train one: python train.py --help (installed: sb3-por-train)."""
 
 import argparse
 import sys
@@ -19,13 +19,15 @@ class Parser(argparse.ArgumentParser):
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     typed = (sys.argv[1:] if arguments is None else arguments)[:1]
+    if typed == ["train"]:
+        raise UserError("training is a program of its own: python train.py --help (installed: sb3-por-train)")
     parser = Parser(prog="python -m sb3_por", description=__doc__)
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for name, command in COMMANDS.items():
         subparser = subparsers.add_parser(
             name,
             help=command.help,
-            description=command.help,
+            description=command.help.replace("%%", "%"),  # argparse formats help, but no description
             epilog=f"example: python -m sb3_por {name} {command.example}",
         )
         if name in typed:  # the others' arguments are not asked for, and cost imports

@@ -201,7 +201,9 @@ def diagnose(
     )
 
 
-def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int = 0, fresh_head: bool = False) -> pd.DataFrame:
+def diagnose_runs(
+    folders: Iterable[str | Path], n_episodes: int = 5, seed: int = 0, fresh_head: bool = False, safe: bool = False
+) -> pd.DataFrame:
     """
     Diagnose the last model of every finished run that learns an order.
 
@@ -209,6 +211,7 @@ def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int 
     :param n_episodes: see :func:`diagnose`
     :param seed: see :func:`diagnose`
     :param fresh_head: see :func:`diagnose`
+    :param safe: Run nothing that the models' files hold
     :return: one row for each model: env, algo (or label), seed, step, and ``Diagnosis.as_dict()`` without single episodes
     :raises UserError: if there is no such model
     """
@@ -218,7 +221,7 @@ def diagnose_runs(folders: Iterable[str | Path], n_episodes: int = 5, seed: int 
         file = run / last_model(identity["env"])
         if not is_finished(run, identity["env"]):
             continue
-        model, environment = resolve(file, identity["env"])
+        model, environment = resolve(file, identity["env"], safe=safe)
         if not isinstance(getattr(model.policy, "objective", None), PartialOrder):
             continue
         measured = diagnose(model, identity["env"], n_episodes, seed, **environment, fresh_head=fresh_head).as_dict()

@@ -82,15 +82,18 @@ def _diagnose(args: argparse.Namespace) -> None:
 
     if args.csv:
         check_output(args.csv, (".csv",))
+    named = [args.model, args.pretrained, args.env, args.algo]
     one = (args.model or args.pretrained) and args.env
-    if bool(args.paths) == bool(one) or (args.csv and not args.paths):
+    if not (args.paths or one) or (args.paths and any(named)) or (args.csv and not args.paths):
         raise UserError("give --model and --env, or folders of runs and perhaps --csv (diagnose --help lists the arguments)")
     if args.paths:
-        table = diagnose_runs(args.paths, args.n_episodes, args.seed, args.fresh_head)
+        table = diagnose_runs(args.paths, args.n_episodes, args.seed, args.fresh_head, args.safe)
         if args.csv:
             with atomic_write(args.csv) as path:
                 table.to_csv(path, index=False, float_format="%.5g")
-        print(table.to_json(orient="records", indent=2) if args.json else table.round(3).to_string(index=False))
+        # A row a run, as in the file; upright where there is one
+        shown = table.round(3).T.to_string(header=False) if len(table) == 1 else table.round(3).to_string(index=False)
+        print(table.to_json(orient="records", indent=2) if args.json else shown)
         return
     model, environment = load_model_and_environment(args)
     check_order(model)
@@ -138,7 +141,7 @@ def _report(args: argparse.Namespace) -> None:
 COMMANDS = {
     "plot": Command(
         help="draw learning curves and comparisons with 95 %% stratified bootstrap intervals",
-        example="logs/sac_por logs/sac --kind tasks -o tasks.pdf --csv scores.csv",
+        example="logs/sac_por logs/sac_drq --kind tasks -o tasks.pdf --csv scores.csv",
         add_arguments=_plot_arguments,
         run=_plot,
     ),

@@ -1,6 +1,8 @@
 """Loading of any saved model for use: with its algorithm and its environment, without its replay buffer."""
 
 import importlib
+import os
+import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -210,6 +212,8 @@ def import_packages(names: Iterable[str]) -> None:
     :param names: modules that register environments
     :raises UserError: if one cannot be imported
     """
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # a console script does not look there, where users have their modules
     for name in names:
         try:
             importlib.import_module(name)
@@ -234,5 +238,8 @@ def find_environment(env_id: str, model: str | Path | None = None, safe: bool = 
         import_packages(packages)
     elif packages and name not in gym.registry:
         raise UserError(f"safe loading does not import the packages of the run, {short(packages)}; --env PACKAGE:{name} does")
-    check_known("environment", name, gym.registry)
+    try:
+        check_known("environment", name, gym.registry)
+    except UserError as error:
+        raise UserError(f"{error}; one of your own needs its module, --env MODULE:{name}") from None
     return name

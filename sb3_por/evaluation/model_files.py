@@ -32,7 +32,10 @@ def model_file(path: str | Path) -> Path:
     if path.is_dir():
         path = the_run(path) / BEST_MODEL
     if not path.is_file():
-        raise UserError(f"there is no model {path}; give a .zip that train.py or model.save() wrote")
+        raise UserError(
+            f"there is no model {path}; give a run's folder such as logs/sac_por/PourWater-v0_1, a .zip that train.py or "
+            "model.save() wrote, or random, nothing or expert where a command takes them"
+        )
     return path
 
 

@@ -12,6 +12,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from hostile_files import Touch, rewrite, serialized, small
+from made_runs import write_run
 from sb3_contrib import TQC, TRPO, CrossQ
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from toy_envs import DotEnv
@@ -343,3 +344,10 @@ def test_models_that_were_written_here_are_loaded_without_a_note(sac_zip, tmp_pa
     shutil.copy(tmp_path / "moved" / MARKER, run / MARKER)
     with pytest.warns(UserNote, match=r"was not written by train.py here"):
         load_model(run)
+
+
+def test_the_models_of_a_folder_are_diagnosed_safely(por_zip, tmp_path, marker, capsys):
+    run = write_run(tmp_path, env="FallingBall-v0")
+    rewrite(por_zip, run / "FallingBall-v0.zip", data={"lr_schedule": serialized(Touch(marker))})
+    main(["diagnose", str(tmp_path), "-n", "1", "--safe"])
+    assert not marker.exists()

@@ -118,12 +118,16 @@ def test_plot_draws_every_figure_into_a_folder(run, tmp_path, capsys):
     [
         ([], "the following arguments are required: COMMAND"),
         (["evalute"], "invalid choice: 'evalute'"),
+        (["train", "--env", "PourWater-v0"], "python train.py --help"),
         (
             ["evaluate", "--model", "RUN", "--env", "pendulum-v1"],
             "unknown environment 'pendulum-v1'; did you mean Pendulum-v1?",
         ),
         (["evaluate", "--model", "RUN", "--env", "PourWater-v0"], "not trained on PourWater-v0"),
-        (["evaluate", "--model", "none.zip", "--env", "Pendulum-v1"], "there is no model none.zip"),
+        (
+            ["evaluate", "--model", "none.zip", "--env", "Pendulum-v1"],
+            "there is no model none.zip; give a run's folder such as",
+        ),
         (["evaluate", "--model", __file__, "--env", "Pendulum-v1"], "corrupt"),
         (["evaluate", "--model", "RUN", "--env", "Pendulum-v1", "--algo", "tqqc"], "did you mean tqc?"),
         (["evaluate", "--model", "RUN", "--env", "Pendulum-v1", "-n", "0"], "at least 1 episode"),
@@ -145,6 +149,8 @@ def test_plot_draws_every_figure_into_a_folder(run, tmp_path, capsys):
         (["plot", "RUN", "-o", "curve.png", "--kind", "order"], "no run has logged a POR loss"),
         (["plot", "RUN", "-o", "curve.png", "--kind", "order", "--step", "9"], "--kind order shows all of training"),
         (["plot", "RUN", "-o", "curve.png", "--step", "500"], "no run was evaluated at step 500"),
+        (["diagnose", "RUN", "--model", "RUN", "--env", "Pendulum-v1"], "give --model and --env, or folders of runs"),
+        (["evaluate", "--model", "RUN", "--env", "Own-v0"], "one of your own needs its module, --env MODULE:Own-v0"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, message, run, capsys):

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from sb3_por.common.errors import UserError
 from sb3_por.visual.algorithm import VisualAlgorithm
-from sb3_por.visual.balance import INTERVAL, EncoderGradients
+from sb3_por.visual.balance import EncoderGradients
 from sb3_por.visual.batch import Frames, demonstrated, encode, interleave, repeat, take
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 
@@ -112,7 +112,7 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         self._metrics.add("ent_coef", self.temperature)
         self._metrics.add("critic_loss", losses.critic)
         if self.policy.objective is not None:
-            if self._balance.ratio is not None and (self._n_updates - 1) % INTERVAL == 0:
+            if self._balance.is_due(self._n_updates):
                 self._balance.measure(self.encoder_gradients(losses))
             self._log_objective(losses.metrics)
             if self.policy.objective_optimizer is None:

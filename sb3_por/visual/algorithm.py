@@ -223,6 +223,8 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         name = type(self).__name__ if tb_log_name is None else tb_log_name
         if self.demos is not None and self.demo_buffer is None:
             self.load_demos(self.demos)
+        if self.bc_coef > 0 and self.demo_buffer is None:
+            warnings.warn("bc_coef has no effect without demonstrations: give demos, or train.py --demos", UserNote)
         return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
 
     @staticmethod
@@ -295,6 +297,11 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
                     ("kind", type(loaded).__name__, type(own).__name__) if type(loaded) is not type(own) else (name, *values)
                 )
                 raise ValueError("the {} of the replay buffer in the file is {}, and this model's is {}".format(*differs))
+        if loaded.buffer_size != own.buffer_size:
+            sizes = [buffer.buffer_size * buffer.n_envs for buffer in (loaded, own)]
+            warnings.warn(
+                "the replay buffer in the file holds {} transitions, and buffer_size {} has no effect".format(*sizes), UserNote
+            )
 
     def get_parameters(self) -> dict[str, Any]:
         """

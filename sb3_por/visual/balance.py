@@ -65,6 +65,20 @@ class GradientBalance:
         #: Averages of the norms of critic and objective; NaN before the first measurement. Saved with the model
         self.norms = th.full((2,), th.nan, device=device)
 
+        self._measured = False
+
+    def is_due(self, update: int) -> bool:
+        """
+        :param update: Number of the update, from 1
+        :return: Whether to measure at it: every ``INTERVAL`` updates, and where there is no measurement yet, as in a model
+            that was trained with a fixed weight
+        """
+        if self.ratio is None:
+            return False
+        # A device is asked once: norms may have come from a file
+        self._measured = self._measured or not self.norms.isnan().any().item()
+        return not self._measured or (update - 1) % INTERVAL == 0
+
     def measure(self, gradients: EncoderGradients) -> None:
         """
         :param gradients: Gradients of one batch

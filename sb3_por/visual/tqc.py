@@ -178,6 +178,15 @@ class VisualTQC(VisualActorCritic, TQC):
             _init_setup_model=_init_setup_model,
         )
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        n_quantiles = self.critic.n_quantiles
+        if not 0 <= self.top_quantiles_to_drop_per_net < n_quantiles:
+            raise ValueError(
+                f"top_quantiles_to_drop_per_net must be at least 0 and below the {n_quantiles} quantiles of a network, "
+                f"got {self.top_quantiles_to_drop_per_net}"
+            )
+
     def _next_values(self, features: th.Tensor, actions: th.Tensor, entropy_term: th.Tensor) -> th.Tensor:
         quantiles = self.critic_target.quantiles(features, actions).flatten(start_dim=1)
         n_kept = self.critic.quantiles_total - self.top_quantiles_to_drop_per_net * self.critic.n_critics

@@ -114,3 +114,14 @@ def test_an_objective_with_an_optimizer_of_its_own_has_nothing_to_balance():
 
     with pytest.raises(ValueError, match="objective_coef cannot balance gradients"):
         Balanced("CnnPolicy", DotEnv(), policy_kwargs=POLICY, buffer_size=10)
+
+
+def test_a_fixed_weight_may_become_a_balanced_one(tmp_path):
+    """Whatever the number of updates so far."""
+    model = make_model(por_coef=0.1)
+    model.train(5, 8)
+    model.save(tmp_path / "model.zip")
+    loaded = SACPOR.load(tmp_path / "model.zip", env=model.env, por_coef="auto_0.1")
+    loaded.learn(1)
+    loaded.train(1, 8)
+    assert loaded.logger.name_to_value["train/por_coef"] > 0

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from toy_envs import DotEnv
 
 from sb3_por import ALGORITHMS, SACCURL, SACPOR, TQCPOR, SACDrQ, VisualSAC, VisualTQC
-from sb3_por.common.errors import UserError
+from sb3_por.common.errors import UserError, UserNote
 
 POLICY = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=8, n_filters=4, strides=(2, 2)))
 
@@ -82,3 +82,16 @@ def test_a_buffer_of_another_model_is_refused(kwargs, message, tmp_path):
     with pytest.raises(ValueError, match=re.escape(message)):
         model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert model.replay_buffer is own
+
+
+def test_a_buffer_of_another_size_is_noted(tmp_path):
+    make_model(SACPOR, buffer_size=50).learn(20).save_replay_buffer(tmp_path / "buffer.pkl")
+    model = make_model(SACPOR)
+    with pytest.warns(UserNote, match="the replay buffer in the file holds 50 transitions, and buffer_size 200 has no effect"):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+
+
+@pytest.mark.parametrize("dropped", [-1, 25])
+def test_a_number_of_quantiles_that_leaves_none_is_refused(dropped):
+    with pytest.raises(ValueError, match="top_quantiles_to_drop_per_net must be at least 0 and below the 25 quantiles"):
+        TQCPOR("MlpPolicy", "Pendulum-v1", buffer_size=10, top_quantiles_to_drop_per_net=dropped)

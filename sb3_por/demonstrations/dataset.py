@@ -53,9 +53,9 @@ class Demonstrations:
         minari = _minari()
         self.path = next((folder for folder in (Path(path), Path(path) / "data") if (folder / METADATA).is_file()), Path(path))
         if not (self.path / METADATA).is_file():
-            raise UserError(
-                f"there are no demonstrations in {path}: no {METADATA} of a Minari dataset; see python -m sb3_por record"
-            )
+            inner = sorted(file.parent for deep in ("*", "*/data") for file in Path(path).glob(f"{deep}/{METADATA}"))
+            hint = f"did you mean {inner[0]}?" if inner else "see python -m sb3_por record"
+            raise UserError(f"there are no demonstrations in {path}: no {METADATA} of a Minari dataset; {hint}")
         try:
             self._dataset = minari.MinariDataset(self.path)
         # Whatever a damaged or foreign file makes Minari and h5py raise

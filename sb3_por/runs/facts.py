@@ -110,7 +110,7 @@ def progress(run: Path) -> tuple[int, float | None]:
     """
     :return: steps that the run has done, to the last episode's end, and its latest mean normalized performance
     """
-    steps, repeat = 0, _action_repeat(run)
+    steps, repeat = 0, control_steps(run)
     for monitor in run.glob(MONITORS):
         rows = (line.split(",") for line in monitor.read_text().splitlines()[2:])
         steps += sum(math.ceil(int(row[1]) / repeat) for row in rows if len(row) > 2)
@@ -123,8 +123,11 @@ def progress(run: Path) -> tuple[int, float | None]:
     return steps, score
 
 
-def _action_repeat(run: Path) -> int:
-    """Control steps of an agent's step: the monitors are inside ``ActionRepeat``, and count the former."""
+def control_steps(run: Path) -> int:
+    """
+    :param run: A run folder
+    :return: Control steps of an agent's step, of which its monitors count the former, since they are inside ``ActionRepeat``
+    """
     wrappers = read_settings(run / run_identity(run)["env"] / HYPERPARAMETERS).get("env_wrapper")
     entries = wrappers if isinstance(wrappers, list) else [wrappers]
     held = [entry[ACTION_REPEAT] for entry in entries if isinstance(entry, dict) and ACTION_REPEAT in entry]

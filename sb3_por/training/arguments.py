@@ -130,6 +130,8 @@ class Parser(argparse.ArgumentParser):
         check_known("algorithm", args.algo, ALGOS)
         if args.demos and args.algo not in ALGORITHMS:
             raise UserError(f"{args.algo} cannot learn from demonstrations; --demos needs one of {', '.join(ALGORITHMS)}")
+        if package := args.env.rpartition(":")[0]:
+            args.gym_packages = [*args.gym_packages, package]  # recorded, so that evaluate finds it
         import_packages(args.gym_packages)
         args.env = find_environment(args.env)
         if args.trained_agent:
@@ -177,6 +179,9 @@ class Parser(argparse.ArgumentParser):
         self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
         args = super().parse_args()
         args.resume = str(run)
+        for name in ("algo", "env"):
+            if getattr(args, name).rpartition(":")[2] != saved.get(name):
+                raise UserError(f"--resume continues {saved.get('algo')} on {saved['env']}; leave out --{name}")
         if args.optimize_hyperparameters:
             raise UserError("--resume continues a run, and -optimize makes many: give one of them")
         self._check(args)

@@ -99,6 +99,9 @@ class EvaluationCallback(EvalCallback):
             kept = arrays["timesteps"] <= self.num_timesteps
             self._history = {name: list(arrays[name][kept]) for name in arrays.files}
         if kept.any():
+            episodes = len(self._history["results"][0])
+            if episodes != len(self.episodes):
+                raise UserError(f"{file} has evaluations of {episodes} episodes: resume with --eval-episodes {episodes}")
             rows = zip(self._history["normalized_performance"], self._history["results"], strict=True)
             self.best_mean_reward = max(score(performance, returns) for performance, returns in rows)
 

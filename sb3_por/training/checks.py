@@ -1,6 +1,7 @@
 """Checks of a run's settings before it is made."""
 
 import inspect
+import re
 import sys
 from typing import Any
 
@@ -12,6 +13,21 @@ from stable_baselines3.common.preprocessing import is_image_space
 from sb3_por.common.checks import check_ranges, check_types
 from sb3_por.common.errors import UserError, check_known
 from sb3_por.visual.algorithm import RANGES
+
+#: Settings that the RL Zoo reads itself, and an algorithm does not get
+OF_THE_ZOO = (
+    *(
+        "n_timesteps",
+        "n_envs",
+        "env_wrapper",
+        "vec_env_wrapper",
+        "vec_env_class",
+        "vec_env_kwargs",
+        "env_kwargs",
+        "frame_stack",
+    ),
+    *("normalize", "callback", "noise_type", "noise_std"),
+)
 
 
 def check_settings(algo: str, settings: dict[str, Any]) -> None:
@@ -28,6 +44,39 @@ def check_settings(algo: str, settings: dict[str, Any]) -> None:
         check_known(f"setting of {algo}", name, inspect.signature(ALGOS[algo]).parameters)
     check_types(ALGOS[algo], settings)
     check_ranges(settings, RANGES)
+
+
+def check_names(algo: str, settings: dict[str, Any]) -> None:
+    """
+    :param algo: Name of an algorithm
+    :param settings: Changes to its settings
+    :raises UserError: If neither the algorithm nor the RL Zoo has a setting of that name; the message has the nearest one
+    """
+    for name in settings:
+        check_known(f"setting of {algo}", name, [*inspect.signature(ALGOS[algo]).parameters, *OF_THE_ZOO])
+
+
+def check_zoo_settings(settings: dict[str, Any]) -> None:
+    """
+    Check what the RL Zoo itself reads, and takes apart without a look.
+
+    :param settings: Hyperparameters
+    :raises UserError: If one cannot be used
+    """
+    for name in ("n_envs", "frame_stack"):
+        value = settings.get(name, 1)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise UserError(f"{name} must be a whole number of at least 1, got {value!r}")
+    if settings.get("noise_type") and "noise_std" not in settings:
+        raise UserError("noise_type needs noise_std")
+    if "seed" in settings:
+        raise UserError("the seed is a flag: --seed")
+    for name in ("learning_rate", "clip_range", "clip_range_vf", "delta_std"):
+        value = settings.get(name)
+        if isinstance(value, str) and not re.fullmatch(r"lin_[-+.e\d]*\d[-+.e\d]*", value):
+            raise UserError(
+                f"{name} must be a number, or lin_NUMBER for one that falls to 0, got {value!r}; YAML needs a point: 1.0e-3"
+            )
 
 
 def check_policy(policy: Any, space: spaces.Space, env_id: str) -> None:

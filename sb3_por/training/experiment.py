@@ -51,7 +51,7 @@ from sb3_por.runs.folder import (
 from sb3_por.common.checks import check_types
 from sb3_por.runs.lock import lock_folder
 from sb3_por.runs.origin import mark_as_own, note_foreign
-from sb3_por.training.checks import check_policy, check_settings
+from sb3_por.training.checks import check_policy, check_settings, check_zoo_settings
 from sb3_por.training.callbacks import CheckpointCallback, EvaluationCallback, SaveBestStatistics, Stopwatch
 from sb3_por.training.full_disk import PatientLogs, keep_playing
 from sb3_por.training.saved_state import check_saved_state
@@ -144,8 +144,8 @@ class Experiment(ExperimentManager):
         """
         try:
             experiment = super().setup_experiment()
-            if experiment is not None and isinstance(experiment[0], VisualAlgorithm) and experiment[0].demos:
-                experiment[0].load_demos(experiment[0].demos)
+            if experiment is not None and self._resumed_run is None:
+                self._load_demos(experiment[0])
         except Exception as error:  # of any package, user's module or setting
             if self._folder_made:
                 shutil.rmtree(self.save_path, ignore_errors=True)
@@ -229,6 +229,8 @@ class Experiment(ExperimentManager):
         with quiet_n_steps():
             model = super()._load_pretrained_agent(hyperparams, env)
         check_saved_state(Path(self.trained_agent), model)
+        if self._resumed_run is not None:
+            self._load_demos(model)  # before the run's settings are written anew
         model.policy.set_training_mode(True)  # a policy that this algorithm cannot train says so now
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
@@ -242,6 +244,18 @@ class Experiment(ExperimentManager):
         if self._resumed_run is not None:
             env.seed((self.seed + model.num_timesteps) % 2**32)
         return model
+
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        """Check them; the zoo takes a word apart."""
+        check_zoo_settings(hyperparams)
+        schedules: dict[str, Any] = ExperimentManager._preprocess_schedules(hyperparams)
+        return schedules
+
+    @staticmethod
+    def _load_demos(model: BaseAlgorithm) -> None:
+        if isinstance(model, VisualAlgorithm) and model.demos:
+            model.load_demos(model.demos)
 
     def _preprocess_action_noise(self, hyperparams: dict[str, Any], saved: dict[str, Any], env: VecEnv) -> dict[str, Any]:
         """Check the settings; the zoo builds the model next."""
@@ -266,7 +280,7 @@ class Experiment(ExperimentManager):
         """
         kwargs: dict[str, Any] = {"callback": self.callbacks, "reset_num_timesteps": not self.continue_training}
         if self.log_interval != -1:
-            kwargs["log_interval"] = self.log_interval if self.log_interval > -1 else None
+            kwargs["log_interval"] = self.log_interval if self.log_interval > 0 else None
         n_timesteps = self.n_timesteps
         if self._checkpoint or self._extends:  # the total
             n_timesteps = max(n_timesteps, model._total_timesteps) - model.num_timesteps

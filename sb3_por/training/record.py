@@ -1,5 +1,6 @@
 """Record demonstrations: a policy plays training scenes in the environment that an algorithm's settings make."""
 
+from copy import deepcopy
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from sb3_por.evaluation.loading import resolve
 from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, import_wrappers
 from sb3_por.runs.folder import import_names
 from sb3_por.training.arguments import hyperparameter_file
+from sb3_por.training.checks import check_names
 from softbody_envs.experts import make_expert
 from softbody_envs.experts.pace import Pace
 from softbody_envs.registration import task_class
@@ -42,13 +44,13 @@ class Recorder(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
         """See ``gymnasium.Env.reset``."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._seed = seed
-        self._observations, self._actions, self._rewards = [observation], list[np.ndarray](), list[float]()
+        self._observations, self._actions, self._rewards = [deepcopy(observation)], list[np.ndarray](), list[float]()
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See ``gymnasium.Env.step``."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._observations.append(observation)
+        self._observations.append(deepcopy(observation))  # some environments reuse their arrays
         self._actions.append(np.array(action))
         self._rewards.append(float(reward))
         if terminated or truncated:
@@ -108,10 +110,13 @@ def settings_environment(
     file = Path(conf_file) if conf_file else hyperparameter_file(algo, env_id, demos)
     try:
         settings = yaml.safe_load(file.read_text())
-        settings = {**(settings[env_id] if env_id in settings else settings["default"]), **(changes or {})}
+        settings = dict(settings[env_id] if env_id in settings else settings["default"])
     except (OSError, yaml.YAMLError, TypeError, KeyError) as error:
         raise UserError(f"cannot read settings for {env_id} from {file}: {one_line(error)}") from error
-    settings["env_kwargs"] = {**(settings.get("env_kwargs") or {}), **(env_kwargs or {})}
+    changes = changes or {}
+    check_names(algo, changes)
+    kwargs = [one.get("env_kwargs") or {} for one in (settings, changes)]
+    settings |= changes | {"env_kwargs": {**kwargs[0], **kwargs[1], **(env_kwargs or {})}}
     return TrainingEnvironment.of_settings(env_id, settings)
 
 

@@ -16,7 +16,7 @@ from sb3_por.__main__ import main
 from sb3_por.common.errors import UserError
 from sb3_por.demonstrations.dataset import Demonstrations, RecordedEpisode, write_demonstrations
 from sb3_por.runs.environment import TrainingEnvironment
-from sb3_por.training.record import record
+from sb3_por.training.record import Recorder, record, settings_environment
 from softbody_envs.experts.pour_water import PourWaterExpert
 from softbody_envs.variations import SPLITS
 from softbody_envs.wrappers import ActionRepeat, ProgressReward
@@ -229,3 +229,38 @@ def test_an_expert_with_several_plans_tries_a_scene_until_it_succeeds(tmp_path, 
     assert 1.0 in evaluation.successes and min(evaluation.normalized_performance) > 0.5
     episodes = list(Demonstrations(tmp_path / "demos").episodes())
     assert len(episodes) == 2 and all((episode.actions != 0).any() for episode in episodes)
+
+
+def test_observations_are_copied():
+    """Gymnasium allows an environment to return the same array at every step."""
+
+    class Counting(gym.Env):
+        observation_space, action_space = gym.spaces.Box(0, 9, (1,)), gym.spaces.Box(-1, 1, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            self.count = np.zeros(1, np.float32)
+            return self.count, {}
+
+        def step(self, action):
+            self.count += 1
+            return self.count, 0.0, self.count[0] == 4, False, {}
+
+    recorder = Recorder(Counting())
+    recorder.reset()
+    while not recorder.episodes:
+        recorder.step(np.zeros(1))
+    assert recorder.episodes[0].observations[:, 0].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_changes_are_those_of_training():
+    kwargs = {"env_kwargs": {"renderer": "tiny"}}
+    env_kwargs = settings_environment("sac_por", "PourWater-v0", changes=kwargs, env_kwargs={"split": "all"}).env_kwargs
+    assert env_kwargs["obs_type"] == "pixels" and env_kwargs["renderer"] == "tiny" and env_kwargs["split"] == "all"
+    with pytest.raises(UserError, match="unknown setting of sac_por 'frame_stak'; did you mean frame_stack"):
+        settings_environment("sac_por", "PourWater-v0", changes={"frame_stak": 3})
+
+
+def test_demonstrations_one_level_below_are_named(poured):
+    path, _ = poured
+    with pytest.raises(UserError, match=f"did you mean {path}"):
+        Demonstrations(path.parent)

@@ -281,3 +281,8 @@ def test_train_refuses_what_cannot_work_and_leaves_no_folder(tmp_path, capsys):
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1
         assert not list((tmp_path / "logs").glob("*/*"))
+
+
+def test_cloning_without_demonstrations_is_noted():
+    with pytest.warns(UserNote, match="bc_coef has no effect without demonstrations"):
+        make_model(VisualSAC, dots(), bc_coef=1.0).learn(1)

@@ -391,3 +391,35 @@ def test_an_extension_that_is_interrupted_is_resumed_again(tmp_path, monkeypatch
         assert sum(lengths) <= 230
     names = [{path.name for path in run.iterdir()} for run in runs]
     assert names[0] == names[1]
+
+
+def test_a_resumed_run_that_cannot_begin_keeps_its_settings(tmp_path, capsys):
+    flags = [
+        "--algo",
+        "sac_por",
+        "--env",
+        "FallingBall-v0",
+        "-n",
+        "30",
+        "--seed",
+        "1",
+        "--eval-freq",
+        "30",
+        "--eval-episodes",
+        "2",
+    ]
+    small = ["learning_starts:10", "buffer_size:60", "batch_size:8", "policy:MlpPolicy", "policy_kwargs:{}"]
+    assert main([*flags, "--env-kwargs", "obs_type:state", "-f", str(tmp_path), "-params", *small]) == 0
+    run = tmp_path / "sac_por" / "FallingBall-v0_1"
+    before = {path: path.read_text() for path in run.glob("FallingBall-v0/*.yml")}
+    for more, message in {
+        ("--demos", "nosuch"): "there are no demonstrations in nosuch",
+        ("--env", "PourWater-v0"): "--resume continues sac_por on FallingBall-v0; leave out --env",
+        ("--algo", "sac"): "leave out --algo",
+    }.items():
+        assert main(["--resume", str(run), "-n", "60", *more]) == 2
+        assert message in capsys.readouterr().err
+        assert {path: path.read_text() for path in run.glob("FallingBall-v0/*.yml")} == before
+    assert main(["--resume", str(run), "-n", "60", "--eval-episodes", "3"]) == 2
+    assert "resume with --eval-episodes 2" in capsys.readouterr().err
+    assert main(["--resume", str(run), "-n", "60", "--eval-episodes", "2"]) == 0

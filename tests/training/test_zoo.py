@@ -196,6 +196,11 @@ def test_runs_started_together_get_folders_of_their_own(tmp_path, monkeypatch):
         (["--algo", "sac", "-params", "callback:builtins.dict"], "callback names dict, which is no callback"),
         (["--algo", "sac", "-params", "env_wrapper:no_such.Wrapper"], "No module named 'no_such'"),
         (["--algo", "sac", "-params", "policy_kwargs:'dict('"], "was never closed"),
+        (["--algo", "sac", "-params", "learning_rate:1e-3x"], "learning_rate must be a number, or lin_NUMBER"),
+        (["--algo", "sac", "-params", "n_envs:0"], "n_envs must be a whole number of at least 1, got 0"),
+        (["--algo", "sac", "-params", "frame_stack:2.0"], "frame_stack must be a whole number of at least 1, got 2.0"),
+        (["--algo", "sac", "-params", "noise_type:normal"], "noise_type needs noise_std"),
+        (["--algo", "sac", "-params", "seed:3"], "the seed is a flag: --seed"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_no_run(flags, message, tmp_path, capsys):
@@ -323,16 +328,17 @@ def test_images_that_are_flattened_are_said(capsys):
     assert "MlpPolicy flattens the images of E-v0 into 4800 numbers" in capsys.readouterr().err
 
 
-def test_an_environment_of_ones_own_is_trained_on_and_its_model_used(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("named", [["--env", "Mine-v0", "--gym-packages", "of_my_own"], ["--env", "of_my_own:Mine-v0"]])
+def test_an_environment_of_ones_own_is_trained_on_and_its_model_used(named, tmp_path, monkeypatch, capsys):
     package = "import gymnasium as gym\nfrom gymnasium.envs.classic_control import PendulumEnv\n"
     package += "if 'Mine-v0' not in gym.registry:\n    gym.register('Mine-v0', PendulumEnv, max_episode_steps=20)\n"
     (tmp_path / "of_my_own.py").write_text(package)
     monkeypatch.syspath_prepend(tmp_path)
-    flags = ["--gym-packages", "of_my_own", "-n", "60", "--eval-freq", "30", "-f", str(tmp_path / "logs")]
+    flags = [*named, "-n", "60", "--eval-freq", "30", "-f", str(tmp_path / "logs")]
     settings = ["policy:MlpPolicy", "env_kwargs:{'g': 5.0}", "normalize:True"]
     hyperparams = tmp_path / "mine.yml"
     hyperparams.write_text("Mine-v0: {policy: MlpPolicy, n_timesteps: 60, env_kwargs: {render_mode: rgb_array}}\n")
-    arguments = [*PENDULUM[:2], "--env", "Mine-v0", *PENDULUM[4:], "-conf", str(hyperparams), *flags, *SMALL, *settings]
+    arguments = [*PENDULUM[:2], *PENDULUM[4:], "-conf", str(hyperparams), *flags, *SMALL, *settings]
     assert main(arguments) == 0
     run = tmp_path / "logs" / "sac" / "Mine-v0_1"
     assert yaml.safe_load((run / "Mine-v0" / "config.yml").read_text())["env_kwargs"] == {"g": 5.0, "render_mode": "rgb_array"}

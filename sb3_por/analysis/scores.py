@@ -1,5 +1,6 @@
 """The table of scores: one row for each evaluation, read from runs or from ``scores.csv``."""
 
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -7,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from sb3_por.analysis.names import METRICS
-from sb3_por.common.errors import UserError, one_line
+from sb3_por.common.errors import UserError, UserNote, one_line
 from sb3_por.common.files import atomic_write
-from sb3_por.runs.facts import run_identity
+from sb3_por.runs.facts import control_steps, run_identity
 from sb3_por.runs.folder import find_runs, read_evaluations, run_arguments
 
 #: Columns that identify a run, and columns that an evaluation measures.
@@ -28,8 +29,25 @@ def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
     given = [Path(path) for path in paths]
     tables = [read_csv(path) for path in given if path.suffix == ".csv"]
     folders = [path for path in given if path.suffix != ".csv"]
-    tables += [read_run(run) for run in find_runs(folders)]
-    return join_runs(tables)
+    runs = find_runs(folders)
+    _note_unlike_steps(runs)
+    return join_runs(tables + [read_run(run) for run in runs])
+
+
+def _note_unlike_steps(runs: Iterable[Path]) -> None:
+    """Tell where runs of a task would share an axis of steps that are not the same."""
+    lengths: dict[str, dict[int, str]] = {}
+    for run in runs:
+        identity = run_identity(run)
+        lengths.setdefault(identity["env"], {}).setdefault(control_steps(run), identity["algo"])
+    for env, algos in lengths.items():
+        if len(algos) > 1:
+            told = ", ".join(f"{n} of {algo}" for n, algo in sorted(algos.items()))
+            warnings.warn(
+                f"on {env} an agent's step is not the same number of control steps ({told}): compare runs that hold "
+                "actions for as long (ActionRepeat)",
+                UserNote,
+            )
 
 
 def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:
@@ -41,13 +59,16 @@ def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:
     :raises UserError: if two runs of one algorithm and environment have one seed
     """
     rows = pd.concat(tables, ignore_index=True)
+    rows.attrs.clear()
     runs = pd.concat([table[RUN_KEYS].drop_duplicates() for table in tables])
     doubled = pd.concat([runs[runs.duplicated()], rows[rows.duplicated([*RUN_KEYS, "step"])]])
     if len(doubled):
         env, algo, seed = doubled.iloc[0][RUN_KEYS]
+        same = doubled.iloc[:1][RUN_KEYS]
+        where = sorted({str(table.attrs["source"]) for table in tables if len(table.merge(same)) and "source" in table.attrs})
         raise UserError(
-            f"there are two runs of {algo} on {env} with seed {seed}; give one of them, or label them: train.py --label "
-            "NAME, or label: NAME in the run's args.yml"
+            f"there are two runs of {algo} on {env} with seed {seed}{': ' if where else ''}{' and '.join(where)}; give one of "
+            "them, or label them: train.py --label NAME, or label: NAME in the run's args.yml"
         )
     return rows.sort_values([*RUN_KEYS, "step"], kind="stable", ignore_index=True)
 
@@ -63,7 +84,7 @@ def read_run(run: Path) -> pd.DataFrame:
     arrays = read_evaluations(run)
     steps = arrays["timesteps"]
     unknown = np.full(len(steps), np.nan)
-    return pd.DataFrame(
+    scores = pd.DataFrame(
         {
             **run_identity(run),
             "step": steps.astype(int),
@@ -75,6 +96,8 @@ def read_run(run: Path) -> pd.DataFrame:
         },
         columns=COLUMNS,
     )
+    scores.attrs["source"] = str(run)
+    return scores
 
 
 def read_csv(path: Path) -> pd.DataFrame:
@@ -103,6 +126,7 @@ def read_csv(path: Path) -> pd.DataFrame:
             raise UserError(f"{path}: the column {column} must hold integers")
     for column in [*METRICS, "wall_clock_s"]:
         scores[column] = pd.to_numeric(scores[column], errors="coerce")
+    scores.attrs["source"] = str(path)
     return scores
 
 

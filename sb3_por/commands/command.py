@@ -47,7 +47,8 @@ def model_arguments(parser: argparse.ArgumentParser, required: bool = True) -> N
     agent = "the trained agent that comes with the package; the best, or that of --algo"
     which.add_argument("--pretrained", action="store_true", help=agent)
     parser.add_argument("--env", required=required, help="environment id")
-    parser.add_argument("--algo", help="algorithm that saved the model, if it cannot be told from the file")
+    algo = "algorithm that saved the model, if it cannot be told from the file; with --pretrained the agent's, or its label"
+    parser.add_argument("--algo", help=algo)
     safe_argument(parser)
 
 

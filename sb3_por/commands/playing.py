@@ -136,12 +136,16 @@ def _rank(args: argparse.Namespace) -> None:
     from sb3_por.analysis.ranking import rank
     from sb3_por.common.files import check_output
     from sb3_por.evaluation.loading import find_environment
+    from sb3_por.ranking.ranker import Ranker
     from sb3_por.ranking.videos import episode_videos, read_videos
     from sb3_por.training.record import EXPERT, find_player, make_training_env, play_training_scenes
 
     check_output(args.output, (".npz",))
     if not args.env and (args.model or args.algo or args.conf_file or args.hyperparams or args.env_kwargs):
         raise UserError("--model and the settings are about an environment: give --env, too")
+    if args.updates < 1:
+        raise UserError(f"--updates must be at least 1, got {args.updates}")
+    Ranker(args.image_size)  # refuses a size before anything is played
     make_env = None
     if args.env:
         trained = args.model if args.model != EXPERT else None

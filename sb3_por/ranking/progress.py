@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_por.common.checks import check_types
 from sb3_por.common.errors import UserError
 from sb3_por.ranking.images import find_image
 from sb3_por.ranking.ranker import Ranker
@@ -33,6 +34,7 @@ class RankedProgress(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Re
     def __init__(self, env: gym.Env[Any, np.ndarray], ranker: str, scale: float = 10.0, gamma: float | None = None):
         gym.utils.RecordConstructorArgs.__init__(self, ranker=str(ranker), scale=scale, gamma=gamma)
         gym.Wrapper.__init__(self, env)
+        check_types(type(self), {"scale": scale, "gamma": gamma})
         if not scale > 0.0:
             raise ValueError(f"scale must be above 0, got {scale!r}")
         if gamma is not None and not 0.0 < gamma <= 1.0:

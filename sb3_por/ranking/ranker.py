@@ -20,7 +20,7 @@ from sb3_por.visual.encoders import ConvEncoder
 FACTS = "facts"
 SUFFIX = ".npz"
 #: Largest size of a file after unpacking, and the sizes of images that a ranker may have
-MAX_BYTES, MIN_SIZE, MAX_SIZE = 64 * 2**20, 24, 256
+MAX_BYTES, MIN_SIZE, MAX_SIZE = 64 * 2**20, 32, 256
 #: Images that pass the encoder at once
 CHUNK = 256
 

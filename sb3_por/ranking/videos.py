@@ -26,6 +26,8 @@ def read_videos(path: str | Path, image_size: int = 64) -> list[np.ndarray]:
     if any((folder / METADATA).is_file() for folder in (path, path / "data")):
         dataset = Demonstrations(path)
         return episode_videos(dataset.episodes(), dataset.observation_space, image_size)
+    if not path.is_dir():
+        raise UserError(f"{path} is no folder of videos" if path.exists() else f"there is no folder {path}")
     files = sorted(file for file in path.glob("*") if file.suffix.lower() in SUFFIXES)
     if not files:
         raise UserError(f"there are no videos in {path}: no {METADATA} of a Minari dataset, and no {', '.join(SUFFIXES)}")
@@ -44,7 +46,7 @@ def episode_videos(
     """
     image = find_image(observation_space)
     if image is None:
-        raise UserError(f"there is no single image in {observation_space}; make videos with python -m sb3_por enjoy")
+        raise UserError(f"there is no single image in {observation_space}; record with images: --env-kwargs obs_type:pixels")
     return [resize(image(episode.observations), image_size) for episode in episodes]
 
 
@@ -52,8 +54,9 @@ def _read(file: Path, image_size: int) -> np.ndarray:
     try:
         if file.suffix.lower() == ".npz":
             with np.load(file, allow_pickle=False) as arrays:
-                (name,) = arrays.files
-                frames = arrays[name]
+                if len(arrays.files) != 1:
+                    raise ValueError(f"an .npz holds one array, of frames; this one has {', '.join(arrays.files)}")
+                frames = arrays[arrays.files[0]]
             if frames.ndim != 4 or frames.dtype != np.uint8:
                 raise ValueError(f"frames are uint8 of (n, height, width, channels), not {frames.dtype} of {frames.shape}")
             video = resize(frames, image_size)

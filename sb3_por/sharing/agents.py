@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_por import ALGORITHMS
 from sb3_por.common.errors import UserError, check_known
 from sb3_por.evaluation.episodes import Evaluation
 
@@ -38,7 +39,7 @@ def agent_name(algo: str, env_id: str) -> str:
 def find_agent(env_id: str, algo: str | None = None, folder: Path | None = None) -> Agent:
     """
     :param env_id: Gymnasium id of a task
-    :param algo: Name of the agent's algorithm; the agent with the best published score if ``None``
+    :param algo: Label of the agent, or its algorithm, of which the best agent counts; any algorithm if ``None``
     :param folder: Folder of agents; those that come with the package if ``None``
     :return: The agent
     :raises UserError: If there is none
@@ -46,11 +47,13 @@ def find_agent(env_id: str, algo: str | None = None, folder: Path | None = None)
     agents = [agent for agent in read_agents(PRETRAINED if folder is None else folder) if agent.facts["env"] == env_id]
     if not agents:
         raise UserError(f"no trained agent of {env_id} comes with the package; train one: python train.py --env {env_id}")
-    by_algo = {agent.facts["algo"]: agent for agent in agents}
+    agents.sort(key=lambda agent: agent.evaluation.score)
     if algo is None:
-        return max(agents, key=lambda agent: agent.evaluation.score)
-    check_known(f"agent of {env_id}", algo, by_algo)
-    return by_algo[algo]
+        return agents[-1]
+    saved_by = {ALGORITHMS[name].__name__: name for name in ALGORITHMS}
+    named = {saved_by.get(agent.facts["class"]): agent for agent in agents} | {agent.facts["algo"]: agent for agent in agents}
+    check_known(f"agent of {env_id}", algo, [name for name in named if name])
+    return named[algo]
 
 
 def read_agents(folder: Path) -> list[Agent]:

@@ -109,6 +109,10 @@ def find_suite(name: str | Path) -> Path:
         return path
     suites = {file.stem: file for file in shipped("suites").glob("*.yml")}
     check_known("suite", str(name), suites)
+    if path.with_suffix(".yml").is_file():
+        raise UserError(
+            f"there is {path}.yml here, and a suite {name} that comes along: type {path}.yml or {suites[str(name)]}"
+        )
     return suites[str(name)]
 
 

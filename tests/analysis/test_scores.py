@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from made_runs import STEPS, write_run
 
 from sb3_por.analysis.figures import plot
@@ -77,7 +78,7 @@ def test_bad_scores_are_refused(tmp_path):
         ("header.csv",): "holds no scores",
         ("words.csv",): "column seed must hold integers",
         ("missing.csv",): "cannot read",
-        ("once", "twice"): "two runs of sac_por on PourWater-v0 with seed 1",
+        ("once", "twice"): "two runs of sac_por on PourWater-v0 with seed 1: .*once.* and .*twice",
     }.items():
         with pytest.raises(UserError, match=message) as error:
             read_scores([tmp_path / path for path in paths])
@@ -89,3 +90,15 @@ def test_two_runs_with_one_seed_are_refused_even_if_no_step_is_in_both(tmp_path)
     write_run(tmp_path / "twice", seed=1, steps=[150, 250, 350])
     with pytest.raises(UserError, match="two runs of sac_por on PourWater-v0 with seed 1"):
         read_scores([tmp_path])
+
+
+def test_steps_of_different_lengths_are_noted(tmp_path, recwarn):
+    for algo, repeat in (("sac", 1), ("sac_por", 10), ("sac_drq", 10)):
+        run = write_run(tmp_path, algo=algo)
+        wrapper = {"softbody_envs.wrappers.ActionRepeat": {"repeat": repeat}}
+        (run / "PourWater-v0" / "config.yml").write_text(yaml.safe_dump({"env_wrapper": [wrapper]}))
+    read_scores([tmp_path / "sac_por", tmp_path / "sac_drq"])
+    assert not recwarn.list
+    read_scores([tmp_path])
+    (note,) = recwarn.list
+    assert "on PourWater-v0 an agent's step is not the same number of control steps (1 of sac, 10 of sac_" in str(note.message)

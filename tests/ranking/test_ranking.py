@@ -197,6 +197,8 @@ def test_pictures_are_rendered_where_none_is_observed(file):
 
 @pytest.mark.parametrize("arguments", [dict(scale=0.0), dict(scale=float("nan")), dict(gamma=0.0), dict(gamma=1.1)])
 def test_wrong_arguments_are_refused(arguments, file):
+    with pytest.raises(TypeError, match=f"{next(iter(arguments))} must be float"):
+        RankedProgress(Walk(), file, **dict.fromkeys(arguments, "x"))
     with pytest.raises(ValueError, match=next(iter(arguments))):
         RankedProgress(Walk(), file, **arguments)
 
@@ -226,6 +228,12 @@ def test_videos_that_cannot_be_read_are_named(content, message, tmp_path):
     for name, value in content.items():
         (tmp_path / name).write_bytes(value) if isinstance(value, bytes) else np.savez(tmp_path / name, frames=value)
     with pytest.raises(UserError, match=message):
+        read_videos(tmp_path)
+
+
+def test_an_npz_holds_frames_alone(tmp_path):
+    np.savez(tmp_path / "a.npz", frames=videos(1)[0], actions=np.zeros(3))
+    with pytest.raises(UserError, match=r"an \.npz holds one array, of frames; this one has frames, actions"):
         read_videos(tmp_path)
 
 
@@ -317,6 +325,9 @@ def test_a_model_trained_in_python_is_scored_by_the_task(walk_id, file):
         (["VIDEOS", "-o", "r.zip"], "r.zip must end in .npz"),
         (["VIDEOS", "-o", "r.npz"], "there are no videos in"),
         (["VIDEOS", "-o", "r.npz", "--env", "Walc-v0"], "did you mean Walk-v0?"),
+        (["VIDEOS", "-o", "r.npz", "--updates", "0"], "--updates must be at least 1, got 0"),
+        (["--model", "expert", "--env", "Walk-v0", "-o", "r.npz", "--image-size", "31"], "32 to 256 pixels a side, not 31"),
+        (["nowhere", "-o", "r.npz"], "there is no folder nowhere"),
     ],
 )
 def test_what_cannot_be_ranked_is_said_in_one_line(arguments, message, walk_id, tmp_path, monkeypatch, capsys):

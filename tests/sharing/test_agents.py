@@ -181,3 +181,10 @@ def test_a_video_of_a_new_process_takes_less_than_20_seconds_of_a_core(folder, t
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 20
     assert (tmp_path / "v.gif").stat().st_size > 0
+
+
+def test_an_agent_goes_by_its_algorithm_too(folder):
+    facts = json.loads((folder / "sac_por-PourWater-v0.json").read_text())
+    assert find_agent("PourWater-v0", "sac_por", folder).facts == facts
+    assert find_agent("PourWater-v0", "worse", folder).facts["class"] == facts["class"] == "SACPOR"
+    assert find_agent("PourWater-v0", "sac_drq").facts["algo"] == "plain"

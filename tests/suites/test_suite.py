@@ -420,3 +420,10 @@ def files_of(run_folder):
     """Without TensorBoard's, whose number is that of the processes."""
     files = {str(path.relative_to(run_folder)) for path in run_folder.rglob("*") if path.is_file()}
     return {name for name in files if not name.startswith("tb/")}
+
+
+def test_a_name_that_means_two_suites_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "main.yml").write_text("algos: [sac]\n")
+    with pytest.raises(UserError, match=r"there is main\.yml here, and a suite main that comes along: type main\.yml or "):
+        find_suite("main")

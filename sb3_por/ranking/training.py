@@ -56,7 +56,7 @@ def train_ranker(
         raise UserError("there are no videos of at least two frames to learn from")
     use_one_thread()
     pairs = _Pairs(videos, [resize(frames, image_size) for frames in negatives], seed)
-    with th.random.fork_rng(devices=[]):
+    with th.random.fork_rng(devices=range(th.cuda.device_count())):
         th.manual_seed(seed)
         ranker = Ranker(image_size).to(get_device(device))
         frames, augment = pairs.frames.to(get_device(device)), RandomShift()

@@ -41,8 +41,15 @@ Settings come from zoo_hyperparams/<algo>.yml (with --demos from demos.yml there
 algorithm. The run goes to <log-folder>/<algo>/<env>_<n>: best_model.zip, evaluations.npz, checkpoints, tb/ for TensorBoard."""
 
 
-#: Our defaults of the zoo's flags, where they differ.
+#: Our defaults of the zoo's flags, where they differ; its help does not show them
 DEFAULTS = {"algo": "sac_por", "env": "PourWater-v0", "eval_freq": 2000, "save_freq": 10_000}
+HELP = {
+    "--algo": f"algorithm (default {DEFAULTS['algo']})",
+    "--env": f"environment id, or MODULE:ID for one of your own (default {DEFAULTS['env']})",
+    "--eval-freq": f"evaluate every N agent steps (default {DEFAULTS['eval_freq']}); never if it is negative",
+    "--save-freq": f"write a checkpoint every N agent steps (default {DEFAULTS['save_freq']}); never if it is negative",
+    "--num-threads": "threads of PyTorch and of numerical libraries (default: OMP_NUM_THREADS, else 1)",
+}
 
 #: File of the settings of all algorithms that learn from demonstrations.
 DEMOS = "demos.yml"
@@ -105,6 +112,7 @@ class Parser(argparse.ArgumentParser):
     def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
         if "--algo" in names:
             del options["choices"]  # checked below, with the nearest name
+        options |= {"help": HELP[name] for name in names if name in HELP}
         return super().add_argument(*names, **options)
 
     def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]  # as the zoo calls it

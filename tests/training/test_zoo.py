@@ -357,6 +357,7 @@ def test_an_environment_of_ones_own_is_trained_on_and_its_model_used(named, tmp_
 def test_help_has_an_example_and_our_defaults():
     shown = subprocess.run([sys.executable, "train.py", "--help"], cwd=ROOT, capture_output=True, text=True)
     assert shown.returncode == 0 and "python train.py --algo sac_por --env PourWater-v0" in shown.stdout
+    assert "evaluate every N agent steps (default 2000)" in " ".join(shown.stdout.split())
 
 
 def test_por_trains_on_pouring_from_the_command_line(tmp_path):

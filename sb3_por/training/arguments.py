@@ -112,7 +112,7 @@ class Parser(argparse.ArgumentParser):
     def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
         if "--algo" in names:
             del options["choices"]  # checked below, with the nearest name
-        options |= {"help": HELP[name] for name in names if name in HELP}
+        options["help"] = next((HELP[name] for name in names if name in HELP), options.get("help"))
         return super().add_argument(*names, **options)
 
     def parse_args(self, *_: Any) -> argparse.Namespace:  # type: ignore[override]  # as the zoo calls it

@@ -185,6 +185,21 @@ def test_workers_outlive_signals_and_a_lost_one_is_an_error_that_closing_does_no
     assert not any(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in others)
 
 
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda env: env.get_attr("spec"),
+        lambda env: env.set_attr("x", 1),
+        lambda env: env.env_is_wrapped(gym.Wrapper),
+        lambda env: env.reset(),
+    ],
+)
+def test_every_question_to_a_lost_worker_is_an_error_in_words(ask, workers):
+    os.kill(workers.processes[1].pid, signal.SIGKILL)
+    with pytest.raises(UserError, match="worker 1 of 2 environment processes was killed by SIGKILL"):
+        ask(workers)
+
+
 @pytest.mark.slow
 def test_workers_end_with_a_process_that_does_not_close_them(tmp_path):
     script = tmp_path / "leaves.py"

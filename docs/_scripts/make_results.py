@@ -412,6 +412,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "claims": claims,
     "areas": lambda: areas("main"),
     "areas_fold": lambda: areas("fold"),
+    "areas_fair": lambda: areas("fair"),
     "power": power,
     "balance": balance,
     "full_speed": lambda: comparison("full_speed"),
@@ -452,7 +453,7 @@ def fill_in(page: str) -> str:
 
 def draw() -> None:
     """Draw the figures of scores and of POR's classifier."""
-    for suite in ("main", "full_speed", "weights", "long", "steady", "rope", "fold", "state"):
+    for suite in ("main", "full_speed", "weights", "long", "steady", "rope", "fold", "state", "fair"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     for suite in ("main", "full_speed"):

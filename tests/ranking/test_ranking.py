@@ -131,7 +131,7 @@ def damaged(path, ranker, **changes):
     [
         ({"facts": np.array({"image_size": SIZE}, dtype=object)}, "allow_pickle"),
         ({"start": np.array([object()])}, "allow_pickle"),
-        ({"facts": np.array(json.dumps({"image_size": 10**6}))}, "24 to 256 pixels"),
+        ({"facts": np.array(json.dumps({"image_size": 10**6}))}, "32 to 256 pixels"),
         ({"facts": np.array(json.dumps({"image_size": 64}))}, "size mismatch"),
         ({"facts": np.array("{}")}, "image_size"),
         ({"facts": np.array("[1]")}, "is not a ranker"),

@@ -413,7 +413,7 @@ def test_a_resumed_run_that_cannot_begin_keeps_its_settings(tmp_path, capsys):
     run = tmp_path / "sac_por" / "FallingBall-v0_1"
     before = {path: path.read_text() for path in run.glob("FallingBall-v0/*.yml")}
     for more, message in {
-        ("--demos", "nosuch"): "there are no demonstrations in nosuch",
+        ("--demos", "nosuch"): "demonstrations",  # that there are none, or what they need
         ("--env", "PourWater-v0"): "--resume continues sac_por on FallingBall-v0; leave out --env",
         ("--algo", "sac"): "leave out --algo",
     }.items():

@@ -10,23 +10,15 @@ from gymnasium.spaces.utils import flatdim
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.preprocessing import is_image_space
 
+from sb3_por import ALGORITHMS
 from sb3_por.common.checks import check_ranges, check_types
 from sb3_por.common.errors import UserError, check_known
 from sb3_por.visual.algorithm import RANGES
 
 #: Settings that the RL Zoo reads itself, and an algorithm does not get
 OF_THE_ZOO = (
-    *(
-        "n_timesteps",
-        "n_envs",
-        "env_wrapper",
-        "vec_env_wrapper",
-        "vec_env_class",
-        "vec_env_kwargs",
-        "env_kwargs",
-        "frame_stack",
-    ),
-    *("normalize", "callback", "noise_type", "noise_std"),
+    *("n_timesteps", "n_envs", "vec_env_class", "vec_env_kwargs", "normalize", "callback", "noise_type", "noise_std"),
+    *("env_kwargs", "env_wrapper", "vec_env_wrapper", "frame_stack"),
 )
 
 
@@ -50,10 +42,13 @@ def check_names(algo: str, settings: dict[str, Any]) -> None:
     """
     :param algo: Name of an algorithm
     :param settings: Changes to its settings
-    :raises UserError: If neither the algorithm nor the RL Zoo has a setting of that name; the message has the nearest one
+    :raises UserError: If there is no such algorithm, or neither it nor the RL Zoo has a setting of that name; the message has
+        the nearest one
     """
+    known = {**ALGOS, **ALGORITHMS}  # ours are among the zoo's only where its command runs
+    check_known("algorithm", algo, known)
     for name in settings:
-        check_known(f"setting of {algo}", name, [*inspect.signature(ALGOS[algo]).parameters, *OF_THE_ZOO])
+        check_known(f"setting of {algo}", name, [*inspect.signature(known[algo]).parameters, *OF_THE_ZOO])
 
 
 def check_zoo_settings(settings: dict[str, Any]) -> None:

@@ -64,7 +64,6 @@ class GradientBalance:
         self.ratio = ratio
         #: Averages of the norms of critic and objective; NaN before the first measurement. Saved with the model
         self.norms = th.full((2,), th.nan, device=device)
-
         self._measured = False
 
     def is_due(self, update: int) -> bool:

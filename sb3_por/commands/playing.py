@@ -1,6 +1,7 @@
 """Commands that play episodes: evaluate, enjoy, record, rank."""
 
 import argparse
+from dataclasses import replace
 import json
 from functools import partial
 from typing import Any
@@ -89,10 +90,13 @@ def _settings(args: argparse.Namespace, needed: bool, demos: bool) -> Any:
 
 
 def _record_arguments(parser: argparse.ArgumentParser) -> None:
+    from sb3_por.training.arguments import add_ranker_arguments
+
     parser.add_argument("--model", required=True, help="expert, a .zip, or a run folder (its best model)")
     safe_argument(parser)
     parser.add_argument("--env", required=True, help="environment id")
     _settings_arguments(parser, "record in the environment that the settings of this algorithm make")
+    add_ranker_arguments(parser)
     parser.add_argument("-o", "--output", required=True, help="folder of the new dataset, in Minari's format")
     parser.add_argument("-n", "--n-episodes", type=int, default=50, help="episodes of training scenes (default 50)")
     parser.add_argument("--seed", type=seed, default=0, help="chooses the scenes (default 0)")
@@ -101,10 +105,17 @@ def _record_arguments(parser: argparse.ArgumentParser) -> None:
 def _record(args: argparse.Namespace) -> None:
     import softbody_envs  # noqa: F401  (registers its ids)
     from sb3_por.evaluation.loading import find_environment
+    from sb3_por.runs.environment import with_ranker
+    from sb3_por.training.arguments import check_ranker
     from sb3_por.training.record import EXPERT, record
 
+    check_ranker(args)
     args.env = find_environment(args.env, None if args.model == EXPERT else args.model, args.safe)
     made_of = _settings(args, needed=args.model == EXPERT, demos=True)
+    if args.ranker:
+        if made_of is None:
+            raise UserError("--ranker adds to the settings of an algorithm: give --algo, too")
+        made_of = replace(made_of, env_wrapper=with_ranker(made_of.env_wrapper, args.ranker, args.ranker_kwargs))
     print(record(args.model, args.env, args.output, args.n_episodes, args.seed, made_of, args.safe))
     print(args.output)
 

@@ -3,16 +3,18 @@
 import json
 import shutil
 import uuid
+import warnings
 from collections.abc import Iterable, Iterator
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_por.common.errors import UserError, one_line
+from sb3_por.common.errors import UserError, UserNote, one_line
 from sb3_por.common.files import check_writable
 
 #: File that Minari keeps in every dataset
@@ -132,7 +134,7 @@ def write_demonstrations(
     check_new(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:
-        storage = MinariStorage.new(temporary, observation_space, action_space, spec, jpeg_encoding=False)
+        storage = MinariStorage.new(temporary, observation_space, action_space, _as_text(spec), jpeg_encoding=False)
         for episode in episodes:
             steps = np.arange(len(episode.rewards))
             ends = steps == len(steps) - 1
@@ -161,6 +163,21 @@ def describe(spec: EnvSpec) -> str:
     kwargs = {name: value for name, value in sorted(spec.kwargs.items()) if name not in IRRELEVANT}
     wrappers = [f"{one.name} {one.kwargs}" for one in spec.additional_wrappers if one.kwargs]
     return " in ".join([f"{spec.id} {kwargs}", *wrappers])
+
+
+def _as_text(spec: EnvSpec | None) -> EnvSpec | None:
+    """The specification as JSON can hold it: a class by its path, and none with arguments that have no text."""
+    if spec is None:
+        return None
+    spec, made_by = copy(spec), cast(Any, spec.entry_point)
+    if hasattr(made_by, "__qualname__"):
+        spec.entry_point = f"{made_by.__module__}:{made_by.__qualname__}"
+    try:
+        spec.to_json()
+    except (TypeError, ValueError) as error:
+        warnings.warn(f"the demonstrations do not tell how to make {spec.id}: {one_line(error)}", UserNote)
+        return None
+    return spec
 
 
 def check_new(path: str | Path) -> None:

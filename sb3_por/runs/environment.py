@@ -156,7 +156,7 @@ def import_wrappers(spec: Any) -> Callable[[Any], Any] | None:
     """
     if not spec:
         return None
-    wrappers = [_import_wrapper(one) for one in (spec if isinstance(spec, list) else [spec])]
+    wrappers = [_import_wrapper(one) for one in _as_list(spec)]
 
     def wrap(env: Any) -> Any:
         for wrapper in wrappers:
@@ -166,13 +166,35 @@ def import_wrappers(spec: Any) -> Callable[[Any], Any] | None:
     return wrap
 
 
-def without_ranker(spec: Any) -> Any:
+def with_ranker(spec: Any, ranker: str, arguments: dict[str, Any]) -> list[Any]:
+    """
+    :param spec: Wrappers, see :func:`import_wrappers`
+    :param ranker: File of a ranker
+    :param arguments: Other arguments of ``RankedProgress``
+    :return: The same with ``RankedProgress`` outermost, in the place of any other
+    """
+    return [*without_ranker(spec), {RANKED_PROGRESS: {"ranker": ranker, **arguments}}]
+
+
+def without_ranker(spec: Any) -> list[Any]:
     """
     :param spec: Wrappers, see :func:`import_wrappers`
     :return: The same without ``RankedProgress``, which changes rewards alone and needs a file: scores are the task's own
     """
-    specs = spec if isinstance(spec, list) else [spec] if spec else []
-    return [one for one in specs if RANKED_PROGRESS not in ([*one] if isinstance(one, dict) else [one])]
+    return [one for one in _as_list(spec) if RANKED_PROGRESS not in ([*one] if isinstance(one, dict) else [one])]
+
+
+def rankers(spec: Any) -> list[str]:
+    """
+    :param spec: Wrappers, see :func:`import_wrappers`
+    :return: The files of the rankers among them
+    """
+    arguments = [one.get(RANKED_PROGRESS) for one in _as_list(spec) if isinstance(one, dict)]
+    return [str(one["ranker"]) for one in arguments if isinstance(one, dict) and "ranker" in one]
+
+
+def _as_list(spec: Any) -> list[Any]:
+    return spec if isinstance(spec, list) else [spec] if spec else []
 
 
 def _import_wrapper(spec: Any) -> Callable[[Any], Any]:

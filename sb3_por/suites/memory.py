@@ -1,20 +1,20 @@
 """Memory that the runs of a suite take together, estimated before they start."""
 
-import ast
 import inspect
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from gymnasium import spaces
 
 from sb3_por.common.memory import available_memory
-from sb3_por.common.shipped import shipped
 from sb3_por.evaluation.loading import LOADABLE
-from sb3_por.suites.suite_file import Run
+from sb3_por.suites.inputs import run_settings
+from sb3_por.suites.run import Run
 from sb3_por.visual.actor_critic import VisualActorCritic
 
 #: Bytes of a process with PyTorch and an environment, without its replay buffer
@@ -44,33 +44,22 @@ def run_memory(run: Run) -> int:
     :param run: A run
     :return: Bytes that it takes at its end: the process and its replay buffer, as far as its settings tell
     """
-    return _memory(run.algo, run.env, run.flags)
+    return _memory(replace(run, seed=0, folder=Path()))
 
 
 @cache
-def _memory(algo: str, env_id: str, flags: tuple[str, ...]) -> int:
+def _memory(run: Run) -> int:
     """See :func:`run_memory`; runs that differ by their seed alone are one."""
-    settings = _settings(algo, env_id, flags)
-    parameter = inspect.signature(LOADABLE[algo]).parameters.get("buffer_size")
+    settings = run_settings(run)
+    parameter = inspect.signature(LOADABLE[run.algo]).parameters.get("buffer_size")
     if parameter is None:
         return PROCESS
-    steps = int(flags[flags.index("-n") + 1]) if "-n" in flags else int(settings.get("n_timesteps", 1e9))
+    steps = int(run.flags[run.flags.index("-n") + 1]) if "-n" in run.flags else int(settings.get("n_timesteps", 1e9))
     size = min(int(settings.get("buffer_size", parameter.default)), steps)
     # SB3's own buffers store the next observation, too.
-    copies = 1 if issubclass(LOADABLE[algo], VisualActorCritic) else 2
-    frame = _observation_size(env_id, settings.get("env_kwargs") or {}) * (settings.get("frame_stack") or 1)
+    copies = 1 if issubclass(LOADABLE[run.algo], VisualActorCritic) else 2
+    frame = _observation_size(run.env, settings.get("env_kwargs") or {}) * (settings.get("frame_stack") or 1)
     return PROCESS + size * copies * frame
-
-
-def _settings(algo: str, env_id: str, flags: tuple[str, ...]) -> dict[str, Any]:
-    """Settings of our file with the suite's changes; the latter alone for algorithms and environments of others."""
-    file = shipped("zoo_hyperparams") / f"{algo}.yml"
-    of_file = yaml.safe_load(file.read_text()) if file.is_file() else {}
-    settings = dict(of_file.get(env_id) or of_file.get("default") or {})
-    pairs = flags[flags.index("-params") + 1 :] if "-params" in flags else ()
-    changes = {name: ast.literal_eval(value) for name, _, value in (pair.partition(":") for pair in pairs)}
-    env_kwargs = {**(settings.get("env_kwargs") or {}), **(changes.get("env_kwargs") or {})}
-    return {**settings, **changes, "env_kwargs": env_kwargs}
 
 
 def _observation_size(env_id: str, env_kwargs: dict[str, Any]) -> int:

@@ -21,6 +21,7 @@ from sb3_por.common.files import check_writable, disk_errors
 from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, read_settings
 from sb3_por.runs.lock import lock_folder
 from sb3_por.suites.cluster import outlive
+from sb3_por.suites.inputs import check_inputs
 from sb3_por.suites.memory import overcommitment
 from sb3_por.suites.pools import LocalPool, Pool
 from sb3_por.suites.suite_file import Run, Suite, find_suite, read_suite, suite_runs
@@ -38,20 +39,23 @@ def run_suite(path: str | Path, root: str | Path = "runs", dry_run: bool = False
     :param dry_run: print the runs and their states, and do nothing
     :param ray: address of a Ray cluster to do the runs on; on this machine if ``None``
     :return: 0 if every run is finished, 1 if some failed
-    :raises UserError: if the file is wrong, or the cluster cannot be used
+    :raises UserError: if the file is wrong, what the runs read is missing, or the cluster cannot be used
     """
     path = find_suite(path)
     suite = read_suite(path)
     folder = Path(root) / path.stem
     runs = suite_runs(suite, folder)
     workers = suite.workers or max((os.cpu_count() or 1) // suite.threads, 1)
-    too_much = overcommitment([run for run in runs if run.state() != "finished"], workers) if ray is None else None
+    left = [run for run in runs if run.state() != "finished"]
+    too_much = overcommitment(left, workers) if ray is None else None
     if too_much is not None:
         warnings.warn(too_much, UserNote)
     if dry_run:
         for run in runs:
             print(f"{run.state():12} {shlex.join(run.command())}")
         return 0
+    if ray is None:  # the machines of a cluster may have folders of their own
+        check_inputs(left)
     check_writable(folder)
     lock = lock_folder(folder, f"another process is at work on the suite in {folder}; wait for it, or give another --root")
     try:

@@ -9,9 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import rl_zoo3.train
 import torch as th
-import yaml
 from rl_zoo3 import ALGOS
 from rl_zoo3.utils import StoreDict
 
@@ -19,7 +17,6 @@ import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import ALGORITHMS
 from sb3_por.common.errors import UserError, UserNote, check_known, one_line
 from sb3_por.common.files import check_writable
-from sb3_por.common.shipped import shipped
 from sb3_por.evaluation.loading import find_environment, import_packages, model_file, read_data
 from sb3_por.ranking.ranker import Ranker
 from sb3_por.runs.checkpoints import (
@@ -29,6 +26,7 @@ from sb3_por.runs.checkpoints import (
 from sb3_por.runs.folder import ARGUMENTS, import_names, last_model, run_arguments, the_run
 from sb3_por.runs.provenance import current_machine, current_provenance
 from sb3_por.runs.versions import current_commit, differences
+from sb3_por.training.hyperparameters import hyperparameter_file, read_hyperparameters
 
 EXAMPLE = """example:
   python train.py --algo sac_por --env PourWater-v0 -n 20000 --seed 1 -params por_coef:10.0 pairing:paper
@@ -50,10 +48,6 @@ HELP = {
     "--save-freq": f"write a checkpoint every N agent steps (default {DEFAULTS['save_freq']}); never if it is negative",
     "--num-threads": "threads of PyTorch and of numerical libraries (default: OMP_NUM_THREADS, else 1)",
 }
-
-#: File of the settings of all algorithms that learn from demonstrations.
-DEMOS = "demos.yml"
-
 
 #: Smallest and largest value of the flags with numbers that are not free; -1 stands for the zoo's default, where it has one
 RANGES = {
@@ -124,10 +118,7 @@ class Parser(argparse.ArgumentParser):
         )
         demos = "folder of demonstrations, from which half of each batch is drawn; see python -m sb3_por record"
         self.add_argument("--demos", metavar="FOLDER", help=demos)
-        ranker = "ranker whose progress is added to the reward; see python -m sb3_por rank (--progress is the zoo's bar)"
-        self.add_argument("--ranker", metavar="FILE", help=ranker)
-        kwargs = "arguments of RankedProgress: scale:10.0, and gamma:0.99 for potential-based shaping"
-        self.add_argument("--ranker-kwargs", nargs="+", default={}, action=Settings, metavar="KEY:VALUE", help=kwargs)
+        add_ranker_arguments(self)
         self.add_argument("--label", metavar="NAME", help="what tables and figures call the run, instead of its algorithm")
         args = super().parse_args()
         if args.resume:
@@ -147,7 +138,7 @@ class Parser(argparse.ArgumentParser):
             read_data(Path(args.trained_agent))
         args.conf_file = args.conf_file or str(hyperparameter_file(args.algo, args.env, bool(args.demos)))
         if args.conf_file.endswith((".yml", ".yaml")):
-            _check_hyperparameters(Path(args.conf_file), args.env)
+            read_hyperparameters(args.conf_file, args.env)  # refuses what the zoo takes apart without a look
         check_writable(args.log_folder)
         if args.tensorboard_log:
             check_writable(args.tensorboard_log)
@@ -173,10 +164,7 @@ class Parser(argparse.ArgumentParser):
             raise UserError(f"--device {args.device}: PyTorch finds no CUDA device here; pass --device cpu")
         if not args.log_folder:
             self.error("-f needs the name of a folder")
-        if args.ranker:
-            Ranker.load(args.ranker)
-        elif args.ranker_kwargs:
-            self.error("--ranker-kwargs are about a ranker: give --ranker, too")
+        check_ranker(args)
 
     def _resumed(self, run: Path) -> argparse.Namespace:
         """The arguments that a run was started with, changed by those given now."""
@@ -207,25 +195,25 @@ class Parser(argparse.ArgumentParser):
         return args
 
 
-def hyperparameter_file(algo: str, env_id: str, demos: bool = False) -> Path:
+def add_ranker_arguments(parser: argparse.ArgumentParser) -> None:
     """
-    The settings of an algorithm for an environment: ours where we list it, else the zoo's, else our default.
+    :param parser: Parser to which ``--ranker`` and ``--ranker-kwargs`` are added
+    """
+    ranker = "ranker whose progress is added to the reward; see python -m sb3_por rank (--progress is the zoo's bar)"
+    parser.add_argument("--ranker", metavar="FILE", help=ranker)
+    kwargs = "arguments of RankedProgress: scale:10.0, and gamma:0.99 for potential-based shaping"
+    parser.add_argument("--ranker-kwargs", nargs="+", default={}, action=Settings, metavar="KEY:VALUE", help=kwargs)
 
-    :param algo: Name of an algorithm
-    :param env_id: Gymnasium id
-    :param demos: Whether it learns from demonstrations: then those of ``demos.yml``, for every algorithm, where we list the
-        environment there
-    :return: The file
-    :raises UserError: If none fits
+
+def check_ranker(args: argparse.Namespace) -> None:
     """
-    folders = shipped("zoo_hyperparams"), Path(rl_zoo3.__file__).parent / "hyperparams"
-    files = [*([folders[0] / DEMOS] if demos else []), *(folder / f"{algo}.yml" for folder in folders)]
-    entries = {file: yaml.safe_load(file.read_text()) for file in files if file.is_file()}
-    for key in (env_id, "default"):
-        for file, settings in entries.items():
-            if key in settings:
-                return file
-    raise UserError(f"there are no settings of {algo} for {env_id}; write some and pass -conf FILE.yml")
+    :param args: Parsed ``--ranker`` and ``--ranker-kwargs``
+    :raises UserError: If the ranker cannot be read, or has arguments without a file
+    """
+    if args.ranker:
+        Ranker.load(args.ranker)
+    elif args.ranker_kwargs:
+        raise UserError("--ranker-kwargs are about a ranker: give --ranker, too")
 
 
 def _choose_threads(args: argparse.Namespace) -> None:
@@ -246,12 +234,3 @@ def _note_changes(args: argparse.Namespace) -> None:
         )
         warnings.warn(f"the run continues where its numbers may differ in the last bits: {told or 'cpu_flags'}", UserNote)
         args.resumed_with = [*getattr(args, "resumed_with", []), {name: now for name, (_, now) in changed.items()}]
-
-
-def _check_hyperparameters(file: Path, env_id: str) -> None:
-    try:
-        settings = yaml.safe_load(file.read_text())
-    except (OSError, yaml.YAMLError) as error:
-        raise UserError(f"cannot read {file}: {one_line(error)}") from error
-    if not isinstance(settings, dict) or not {env_id, "default"} & set(settings):
-        raise UserError(f"{file} has no entry {env_id} and no entry default")

@@ -32,7 +32,7 @@ from sb3_por.runs.checkpoints import (
     restore_buffer,
     restore_monitors,
 )
-from sb3_por.runs.environment import RANKED_PROGRESS, TrainingEnvironment, read_normalization, without_ranker
+from sb3_por.runs.environment import TrainingEnvironment, read_normalization, with_ranker
 from sb3_por.runs.folder import (
     ARGUMENTS,
     BEST_STATISTICS,
@@ -99,8 +99,8 @@ class Experiment(ExperimentManager):
             hyperparams = dict(saved)
         self.env_kwargs = hyperparams["env_kwargs"] = saved["env_kwargs"] = {**(hyperparams.get("env_kwargs") or {}), **given}
         if self.args.ranker:
-            ranked = {RANKED_PROGRESS: {"ranker": self.args.ranker, **self.args.ranker_kwargs}}
-            hyperparams["env_wrapper"] = saved["env_wrapper"] = [*without_ranker(saved.get("env_wrapper")), ranked]
+            wrappers = with_ranker(saved.get("env_wrapper"), self.args.ranker, self.args.ranker_kwargs)
+            hyperparams["env_wrapper"] = saved["env_wrapper"] = wrappers
         if "normalize" in saved:
             hyperparams["normalize"] = saved["normalize"] = read_normalization(saved["normalize"])
             check_types(VecNormalize, saved["normalize"] if isinstance(saved["normalize"], dict) else {})

@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
@@ -18,8 +17,8 @@ from sb3_por.evaluation.episodes import Episode, Evaluation, FixedEpisodes, Mode
 from sb3_por.evaluation.loading import resolve
 from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, import_wrappers
 from sb3_por.runs.folder import import_names
-from sb3_por.training.arguments import hyperparameter_file
 from sb3_por.training.checks import check_names
+from sb3_por.training.hyperparameters import changed, hyperparameter_file, read_hyperparameters
 from softbody_envs.experts import make_expert
 from softbody_envs.experts.pace import Pace
 from softbody_envs.registration import task_class
@@ -107,16 +106,10 @@ def settings_environment(
     :return: The environment that ``train.py``, with ``--demos`` or without, would train in
     :raises UserError: If there are no settings
     """
-    file = Path(conf_file) if conf_file else hyperparameter_file(algo, env_id, demos)
-    try:
-        settings = yaml.safe_load(file.read_text())
-        settings = dict(settings[env_id] if env_id in settings else settings["default"])
-    except (OSError, yaml.YAMLError, TypeError, KeyError) as error:
-        raise UserError(f"cannot read settings for {env_id} from {file}: {one_line(error)}") from error
+    settings = read_hyperparameters(conf_file or hyperparameter_file(algo, env_id, demos), env_id)
     changes = changes or {}
     check_names(algo, changes)
-    kwargs = [one.get("env_kwargs") or {} for one in (settings, changes)]
-    settings |= changes | {"env_kwargs": {**kwargs[0], **kwargs[1], **(env_kwargs or {})}}
+    settings = changed(settings, changes, {"env_kwargs": env_kwargs})
     return TrainingEnvironment.of_settings(env_id, settings)
 
 

@@ -17,9 +17,8 @@ from sb3_por.visual.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, Visu
 class VisualSAC(VisualActorCritic, SAC):
     """
     Soft actor-critic (SAC) for images, and for everything else that SB3's SAC takes, with the conventions of CURL and DrQ: the
-    critic's loss trains the encoder, the actor sees detached convolutional features through a projection of its own, images
-        are
-    shifted at random, frames are stored once.
+    critic's loss trains the encoder, the actor sees detached convolutional features through a projection of its own,
+    images are shifted at random, frames are stored once.
 
     Arguments are SB3's in SB3's order, then keywords of its own. Subclasses add an auxiliary objective.
 

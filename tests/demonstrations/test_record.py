@@ -1,19 +1,22 @@
 """Recording, and datasets that others have written."""
 
+import functools
 import sys
 import types
+from contextlib import nullcontext
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from stable_baselines3 import SAC
 from toy_envs import DotEnv
 
 import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por import SACPOR, VisualSAC
 from sb3_por.__main__ import main
-from sb3_por.common.errors import UserError
+from sb3_por.common.errors import UserError, UserNote
 from sb3_por.demonstrations.dataset import Demonstrations, RecordedEpisode, write_demonstrations
 from sb3_por.runs.environment import TrainingEnvironment
 from sb3_por.training.record import Recorder, record, settings_environment
@@ -96,7 +99,8 @@ def test_a_trained_model_is_recorded_in_its_environment(tmp_path, capsys):
         (["--model", "nothing.zip", "--env", "Pendulum-v1"], "there is no model nothing.zip"),
         (["--model", "expert", "--env", "PourWater-v0", "-n", "0"], "at least 1 episode"),
         (["--model", "expert", "--env", "PourWater-v0", "--env-kwargs", "image_size:-1"], "cannot make PourWater-v0"),
-        (["--model", "expert", "--env", "PourWater-v0", "-conf", "none.yml"], "cannot read settings for PourWater-v0"),
+        (["--model", "expert", "--env", "PourWater-v0", "-conf", "none.yml"], "cannot read none.yml"),
+        (["--model", "expert", "--env", "PourWater-v0", "--ranker", "none.npz"], "there is no ranker none.npz"),
         (["--model", "RUN", "--env", "Pendulum-v1", "--env-kwargs", "g:9.0"], "give --algo, too"),
     ],
 )
@@ -107,6 +111,44 @@ def test_what_cannot_be_recorded_is_said_in_one_line(arguments, message, tmp_pat
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not (tmp_path / "demos").exists()
+
+
+class Line(gym.Env):
+    """A step up, a step down, and the end."""
+
+    observation_space, action_space = spaces.Box(-9, 9, (1,)), spaces.Box(-1, 1, (1,))
+
+    def __init__(self, name=str):
+        self.name = name
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = 2
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.left -= 1
+        return np.ones(1, np.float32), 0.0, self.left == 0, False, {}
+
+
+@pytest.mark.parametrize(
+    "entry_point, kwargs, known",
+    [(Line, {}, True), (Line, {"name": len}, False), (functools.partial(Line), {}, False)],
+    ids=["class", "function as argument", "partial"],
+)
+def test_an_environment_registered_by_its_class_is_recorded(entry_point, kwargs, known, tmp_path):
+    """Gymnasium cannot write such a specification; by then all episodes have been played."""
+    gym.register("Line-v0", entry_point, kwargs=kwargs, max_episode_steps=5)
+    try:
+        model = SAC("MlpPolicy", gym.make("Line-v0"), buffer_size=10, seed=0)
+        with nullcontext() if known else pytest.warns(UserNote, match="do not tell how to make Line-v0"):
+            record(model, "Line-v0", tmp_path / "demos", 2, made_of=TrainingEnvironment("Line-v0"))
+        demonstrations = Demonstrations(tmp_path / "demos")
+        assert len(demonstrations) == 2 and (demonstrations.spec is not None) == known
+        if known:
+            assert isinstance(gym.make(demonstrations.spec).unwrapped, Line)
+    finally:
+        del gym.registry["Line-v0"]
 
 
 def tree_map(function, tree, *others):

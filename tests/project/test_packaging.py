@@ -152,7 +152,7 @@ def test_an_installed_package_holds_its_data_and_finds_it(installed):
         assert there == here
     assert (package / "analysis" / "report.html.jinja").is_file()
     assert all((package.parent / name / "py.typed").is_file() for name in PACKAGES)
-    script = "from sb3_por.training.arguments import hyperparameter_file as f; print(f('sac_por', 'PourWater-v0'))"
+    script = "from sb3_por.training.hyperparameters import hyperparameter_file as f; print(f('sac_por', 'PourWater-v0'))"
     shown = run_installed(installed, "python", "-c", script)
     assert shown.stdout.strip() == str(package / "shipped" / "zoo_hyperparams" / "sac_por.yml"), shown.stderr
 

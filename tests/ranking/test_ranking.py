@@ -13,7 +13,7 @@ from sb3_por import VisualSAC
 from sb3_por.__main__ import main
 from sb3_por.analysis.ranking import RandomPlay, measure, play_at_random, rank
 from sb3_por.common.errors import UserError
-from sb3_por.demonstrations.dataset import RecordedEpisode, write_demonstrations
+from sb3_por.demonstrations.dataset import Demonstrations, RecordedEpisode, write_demonstrations
 from sb3_por.evaluation import evaluate
 from sb3_por.evaluation.episodes import evaluation_episodes
 from sb3_por.evaluation.video import write_video
@@ -336,6 +336,21 @@ def test_what_cannot_be_ranked_is_said_in_one_line(arguments, message, walk_id, 
     assert main(["rank", *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+def test_demonstrations_can_have_the_rankers_rewards(walk_id, file, tmp_path, capsys):
+    model = SAC("CnnPolicy", gym.make(walk_id), buffer_size=10, policy_kwargs=dict(net_arch=[8]), seed=0)
+    model.save(tmp_path / "model.zip")
+    flags = ["record", "--model", str(tmp_path / "model.zip"), "--env", walk_id, "-n", "1", "-o"]
+    ranked = ["--ranker", file, "--ranker-kwargs", "scale:3.0"]
+    assert main([*flags, str(tmp_path / "none"), *ranked]) == 2
+    assert "give --algo, too" in capsys.readouterr().err and not (tmp_path / "none").exists()
+    assert main([*flags, str(tmp_path / "plain"), "--algo", "sac_drq"]) == 0
+    assert main([*flags, str(tmp_path / "ranked"), "--algo", "sac_drq", *ranked]) == 0
+    plain, ranked_ = (next(Demonstrations(tmp_path / name).episodes()) for name in ("plain", "ranked"))
+    potential = Ranker.load(file).potential(plain.observations)
+    assert np.array_equal(ranked_.actions, plain.actions)
+    assert np.allclose(ranked_.rewards - plain.rewards, 3.0 * np.diff(potential), atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from stable_baselines3 import SAC
 from sb3_por import SACPOR
 from sb3_por.__main__ import main
 from sb3_por.suites import memory
+from sb3_por.suites.inputs import run_settings
 from sb3_por.suites.memory import PROCESS, overcommitment, run_memory
 from sb3_por.suites.suite_file import read_suite, suite_runs
 
@@ -49,6 +50,14 @@ def test_the_buffer_never_holds_more_than_the_steps_of_the_run(runs):
     assert (run_memory(long[0]) - PROCESS) == 10 * (run_memory(short[0]) - PROCESS)
     assert run_memory(runs(GRID.replace("sac_por", "ppo"))[0]) == PROCESS
     assert run_memory(runs(GRID.replace("image_size: 40", "no_such: 1"))[0]) == PROCESS
+
+
+def test_with_demonstrations_the_settings_are_theirs(runs):
+    text = GRID.replace("FallingBall-v0", "FoldCloth-v0").replace(
+        "hyperparams: {buffer_size: 3000, env_kwargs: {image_size: 40}}", ""
+    )
+    of_demos = run_settings(runs(f"{text}demos: demos\n")[0])
+    assert of_demos["bc_coef"] > 0 and "bc_coef" not in run_settings(runs(text)[0])
 
 
 def test_runs_that_do_not_fit_together_are_told_before_they_start(runs, monkeypatch, tmp_path, capsys):

@@ -144,6 +144,22 @@ def test_whatever_a_suite_file_holds_the_error_is_one_line(tmp_path_factory, tex
     assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
 
+def test_a_suite_without_what_its_runs_read_starts_none(suite_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    wrapper = "[{sb3_por.ranking.progress.RankedProgress: {ranker: pour.npz}}]"
+    file = suite_file(
+        "algos: [sac_drq, ranked]\nenvs: [PourWater-v0]\nseeds: [0, 1]\ndemos: of_experts\n"
+        f"variants:\n  ranked: {{algo: sac_drq, env_wrapper: {wrapper}}}\n"
+    )
+    demos = Path("of_experts") / "PourWater-v0"
+    for made, named in ((None, f"{demos} (of PourWater-v0/ranked/seed_1), pour.npz"), (demos, "not there: pour.npz (of")):
+        if made is not None:
+            made.mkdir(parents=True)
+        assert main(["suite", str(file)]) == 2
+        assert named in capsys.readouterr().err and not Path("runs").exists()
+    assert main(["suite", str(file), "--dry-run"]) == 0
+
+
 def test_the_suites_that_come_along_are_sound():
     for file in (ROOT / "suites").glob("*.yml"):
         assert isinstance(read_suite(file), Suite)

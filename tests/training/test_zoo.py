@@ -24,9 +24,10 @@ from sb3_por.analysis.scores import read_scores
 from sb3_por.common.errors import UserError
 from sb3_por.evaluation.loading import load_model
 from sb3_por.runs.facts import run_identity
-from sb3_por.training.arguments import Settings, hyperparameter_file
+from sb3_por.training.arguments import Settings
 from sb3_por.training.checks import check_policy
 from sb3_por.training.experiment import Experiment
+from sb3_por.training.hyperparameters import hyperparameter_file
 from sb3_por.training.zoo import main
 from softbody_envs import ENV_IDS
 

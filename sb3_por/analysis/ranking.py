@@ -13,11 +13,10 @@ from sb3_por.analysis.controls import PlayedFrames, clock, mean, spearman, withi
 from sb3_por.analysis.plot_style import save_figure, style
 from sb3_por.common.errors import UserError
 from sb3_por.common.files import check_output
-from sb3_por.evaluation.episodes import Episode, evaluation_episodes
+from sb3_por.evaluation.episodes import Episode, evaluation_episodes, training_episodes
 from sb3_por.ranking.images import find_image, resize
 from sb3_por.ranking.ranker import SUFFIX, Ranker
 from sb3_por.ranking.training import train_ranker
-from sb3_por.training.record import training_episodes
 
 #: Quantities in ``info`` that a potential is compared with
 QUANTITIES = ("normalized_performance", "monotone")

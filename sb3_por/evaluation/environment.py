@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack,
 
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.common.frames import n_stacked
-from sb3_por.evaluation.episodes import FixedEpisodes, Model, evaluation_kwargs
+from sb3_por.evaluation.episodes import FixedEpisodes, Model, scene_kwargs
 from sb3_por.evaluation.plain_files import STATISTICS, normalize, read_json
 from sb3_por.runs.environment import EnvWrapper, VecEnvWrapper
 from softbody_envs.registration import task_class
@@ -62,7 +62,7 @@ def make_wrapped(
     :return: One vectorized environment that plays held-out episodes; frames are not stacked, images not transposed
     :raises UserError: If the environment cannot be made
     """
-    kwargs = evaluation_kwargs(env_id) | env_kwargs
+    kwargs = scene_kwargs(env_id, "eval") | env_kwargs
 
     def make() -> gym.Env:
         env: gym.Env = Monitor(gym.make(env_id, **kwargs))

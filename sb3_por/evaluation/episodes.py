@@ -150,9 +150,25 @@ def evaluation_episodes(env_id: str, n_episodes: int, seed: int = EVAL_SEED) -> 
     return [Episode(k, seed + k, held_out[k % len(held_out)] if has_variations else None) for k in range(n_episodes)]
 
 
-def evaluation_kwargs(env_id: str) -> dict[str, Any]:
-    """Arguments of the constructor of an evaluation environment that a training environment does not get."""
-    return {"split": "eval"} if task_class(env_id) is not None else {}
+def training_episodes(env_id: str, n_episodes: int, seed: int) -> list[Episode]:
+    """
+    :param env_id: Gymnasium id
+    :param n_episodes: Number of episodes
+    :param seed: Chooses the scenes
+    :return: Episodes in training scenes drawn without replacement, as long as there are any left
+    """
+    train, has_variations = SPLITS["train"], task_class(env_id) is not None
+    order = np.random.default_rng(seed).permutation(train)
+    return [Episode(k, seed + k, int(order[k % len(order)]) if has_variations else None) for k in range(n_episodes)]
+
+
+def scene_kwargs(env_id: str, split: str) -> dict[str, Any]:
+    """
+    :param env_id: Gymnasium id
+    :param split: ``"train"`` or ``"eval"``
+    :return: Arguments of the constructor of an environment with these scenes; none for environments that have no variations
+    """
+    return {"split": split} if task_class(env_id) is not None else {}
 
 
 def whole_episodes(env_kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,15 @@ import softbody_envs  # noqa: F401  (registers its ids)
 from sb3_por.common import plain
 from sb3_por.common.errors import UserError, UserNote, one_line
 from sb3_por.common.files import DISK_ERRORS, DiskError, atomic_write, remove_unfinished
-from sb3_por.evaluation.episodes import FixedEpisodes, evaluation_episodes, evaluation_kwargs, has_diverged, whole_episodes
+from sb3_por.evaluation.episodes import (
+    Episode,
+    FixedEpisodes,
+    evaluation_episodes,
+    has_diverged,
+    scene_kwargs,
+    training_episodes,
+    whole_episodes,
+)
 from sb3_por.evaluation.loading import quiet_n_steps
 from sb3_por.runs.checkpoints import (
     MODEL,
@@ -58,6 +66,9 @@ from sb3_por.training.saved_state import check_saved_state
 from sb3_por.training.trials import trial_settings
 from sb3_por.training.workers import WorkerProcesses
 from sb3_por.visual.algorithm import VisualAlgorithm
+
+#: Seed of the first episode by which a search scores a trial; far from those of evaluations
+SEARCH_SEED = 1_000_000
 
 
 class Experiment(ExperimentManager):
@@ -104,8 +115,8 @@ class Experiment(ExperimentManager):
         if "normalize" in saved:
             hyperparams["normalize"] = saved["normalize"] = read_normalization(saved["normalize"])
             check_types(VecNormalize, saved["normalize"] if isinstance(saved["normalize"], dict) else {})
-        held_out = evaluation_kwargs(self.env_name.gym_id)
-        self.eval_env_kwargs = {**whole_episodes(self.env_kwargs), **held_out, **(self._eval_env_kwargs_args or {})}
+        scenes = scene_kwargs(self.env_name.gym_id, "train" if self.optimize_hyperparameters else "eval")
+        self.eval_env_kwargs = {**whole_episodes(self.env_kwargs), **scenes, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved
 
     def create_log_folder(self) -> None:
@@ -161,7 +172,7 @@ class Experiment(ExperimentManager):
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
-        Evaluation plays the same held-out episodes each time; the zoo's begin as the training environment does.
+        Evaluation plays the same episodes each time; the zoo's begin as the training environment does.
         ``VecNormalize`` is the outermost wrapper, since the replay buffer stores what it receives.
         """
         inner, last = self.env_wrapper, FixedEpisodes if eval_env else keep_playing
@@ -171,8 +182,14 @@ class Experiment(ExperimentManager):
         finally:
             self.env_wrapper = inner
         if eval_env:
-            env.env_method("play", evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes))
+            env.env_method("play", self._scored_episodes())
         return super()._maybe_normalize(env, eval_env)
+
+    def _scored_episodes(self) -> list[Episode]:
+        """Held-out episodes; for a search those of training scenes, so that scores of what it finds are of unseen ones."""
+        if self.optimize_hyperparameters:
+            return training_episodes(self.env_name.gym_id, self.n_eval_episodes, SEARCH_SEED)
+        return evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes)
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         """Leave it to ``create_envs``; the zoo normalizes inside of the frame stack."""
@@ -203,7 +220,7 @@ class Experiment(ExperimentManager):
             self.callbacks.append(
                 EvaluationCallback(
                     self.create_envs(self.n_eval_envs, eval_env=True),
-                    evaluation_episodes(self.env_name.gym_id, self.n_eval_episodes),
+                    self._scored_episodes(),
                     self.eval_freq,
                     self.save_path,
                     stopwatch,

@@ -13,7 +13,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.demonstrations.dataset import RecordedEpisode, check_new, write_demonstrations
 from sb3_por.evaluation.environment import make_evaluation_env
-from sb3_por.evaluation.episodes import Episode, Evaluation, FixedEpisodes, Model, run_episodes
+from sb3_por.evaluation.episodes import (
+    Episode,
+    Evaluation,
+    FixedEpisodes,
+    Model,
+    run_episodes,
+    scene_kwargs,
+    training_episodes,
+)
 from sb3_por.evaluation.loading import resolve
 from sb3_por.runs.environment import EnvWrapper, TrainingEnvironment, import_wrappers
 from sb3_por.runs.folder import import_names
@@ -21,8 +29,6 @@ from sb3_por.training.checks import check_names
 from sb3_por.training.hyperparameters import changed, hyperparameter_file, read_hyperparameters
 from softbody_envs.experts import make_expert
 from softbody_envs.experts.pace import Pace
-from softbody_envs.registration import task_class
-from softbody_envs.variations import SPLITS
 
 #: Name of the scripted expert among models.
 EXPERT = "expert"
@@ -224,7 +230,7 @@ def make_training_env(env_id: str, env_kwargs: dict[str, Any], env_wrapper: EnvW
     :return: The environment, with training scenes
     :raises UserError: If it cannot be made
     """
-    kwargs = env_kwargs | ({"split": "train"} if task_class(env_id) is not None else {})
+    kwargs = env_kwargs | scene_kwargs(env_id, "train")
     try:
         env: gym.Env[Any, np.ndarray] = gym.make(env_id, **kwargs)
         return env if env_wrapper is None else env_wrapper(env)
@@ -239,18 +245,6 @@ def environment_parts(made_of: TrainingEnvironment) -> dict[str, Any]:
     :raises UserError: If a wrapper cannot be imported
     """
     return {"env_kwargs": import_names(made_of.env_kwargs or {}), "env_wrapper": import_wrappers(made_of.env_wrapper)}
-
-
-def training_episodes(env_id: str, n_episodes: int, seed: int) -> list[Episode]:
-    """
-    :param env_id: Gymnasium id
-    :param n_episodes: Number of episodes
-    :param seed: Chooses the scenes
-    :return: Episodes in training scenes drawn without replacement, as long as there are any left
-    """
-    train, has_variations = SPLITS["train"], task_class(env_id) is not None
-    order = np.random.default_rng(seed).permutation(train)
-    return [Episode(k, seed + k, int(order[k % len(order)]) if has_variations else None) for k in range(n_episodes)]
 
 
 def _best_attempt(player: Any, venv: VecEnv, recorder: Recorder, episode: Episode) -> tuple[Evaluation, RecordedEpisode]:

@@ -22,6 +22,7 @@ from sb3_por import ALGORITHMS
 from sb3_por.__main__ import main as evaluation_main
 from sb3_por.analysis.scores import read_scores
 from sb3_por.common.errors import UserError
+from sb3_por.evaluation.episodes import FixedEpisodes
 from sb3_por.evaluation.loading import load_model
 from sb3_por.runs.facts import run_identity
 from sb3_por.training.arguments import Settings
@@ -30,6 +31,7 @@ from sb3_por.training.experiment import Experiment
 from sb3_por.training.hyperparameters import hyperparameter_file
 from sb3_por.training.zoo import main
 from softbody_envs import ENV_IDS
+from softbody_envs.variations import SPLITS
 
 ROOT = Path(__file__).parents[2]
 PENDULUM = ["--algo", "sac", "--env", "Pendulum-v1", "--eval-episodes", "2", "--seed", "1", "--num-threads", "1"]
@@ -231,6 +233,24 @@ def test_a_search_leaves_its_report_and_no_run(tmp_path, capsys):
     assert main([*PENDULUM, *flags, *SMALL]) == 0
     assert {path.suffix for path in (tmp_path / "sac").iterdir()} == {".csv", ".pkl"}
     assert main(["--resume", str(tmp_path), "-optimize"]) == 2
+
+
+def test_a_search_does_not_see_the_held_out_episodes(tmp_path, monkeypatch):
+    played, play = [], FixedEpisodes.play
+
+    def note(env, episodes):
+        played.append((env.unwrapped.split, episodes))
+        play(env, episodes)
+
+    monkeypatch.setattr(FixedEpisodes, "play", note)
+    state = ["--algo", "sac", "--env", "PourWater-v0", "-n", "60", "--eval-episodes", "3", "-f", str(tmp_path), *SMALL]
+    assert main([*state, "-optimize", "--n-trials", "1", "--no-optim-plots", "--n-evaluations", "1"]) == 0
+    assert main([*state, "--eval-freq", "1000"]) == 0
+    (split, searched), (held_out_split, held_out), *_ = played
+    assert (split, held_out_split) == ("train", "eval")
+    for split, episodes in (("train", searched), ("eval", held_out)):
+        assert {one.variation for one in episodes} <= set(SPLITS[split])
+    assert len(searched) == 3 and not {one.seed for one in searched} & {one.seed for one in held_out}
 
 
 def test_training_that_diverges_is_one_line_and_keeps_the_checkpoints(tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shutil
 import sys
 
 from sb3_por.commands.command import Command, load_model_and_environment, model_arguments, seed
@@ -91,8 +92,8 @@ def _diagnose(args: argparse.Namespace) -> None:
         if args.csv:
             with atomic_write(args.csv) as path:
                 table.to_csv(path, index=False, float_format="%.5g")
-        # A row a run, as in the file; upright where there is one
-        shown = table.round(3).T.to_string(header=False) if len(table) == 1 else table.round(3).to_string(index=False)
+        # The file has a row a run; there are too many measurements for one line
+        shown = table.round(3).T.to_string(header=False, line_width=shutil.get_terminal_size().columns)
         print(table.to_json(orient="records", indent=2) if args.json else shown)
         return
     model, environment = load_model_and_environment(args)

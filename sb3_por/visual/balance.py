@@ -83,6 +83,8 @@ class GradientBalance:
         :param gradients: Gradients of one batch
         """
         norms = th.stack([gradients.critic.norm(), gradients.objective.norm()])
+        # One that overflows would stay in the averages; it is left out, and the losses tell whether training has diverged
+        norms = th.where(norms.isfinite().all(), norms, self.norms)
         # From 0, unlike from the first measurement, which would count ten times as much as the second. The bias of both
         # averages, which Adam corrects, cancels in their quotient
         self.norms = self.norms.nan_to_num(0.0).lerp(norms, SMOOTHING)

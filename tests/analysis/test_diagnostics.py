@@ -171,7 +171,13 @@ def test_runs_become_a_table_of_what_their_classifiers_learned(model_file, tmp_p
     assert (table["leak_loss"].item(), table["correlation"].item()) == (expected.leak_loss, expected.orders["own"].correlation)
     assert main(["diagnose", str(tmp_path), "-n", "1", "--csv", str(tmp_path / "table.csv")]) == 0
     assert {"clock_correlation", "partial_correlation", "equal_time_accuracy"} < set(table.columns)
-    assert "mine" in capsys.readouterr().out and (tmp_path / "table.csv").read_text().startswith("env,algo,seed,step,loss,")
+    shown = capsys.readouterr().out
+    assert "mine" in shown and max(map(len, shown.splitlines())) <= 80
+    second = write_run(tmp_path, env="FallingBall-v0", seed=5, label="other")
+    shutil.copy(model_file, second / "FallingBall-v0.zip")
+    assert main(["diagnose", str(tmp_path), "-n", "1"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].split() == ["algo", "mine", "other"]
+    assert (tmp_path / "table.csv").read_text().startswith("env,algo,seed,step,loss,")
     with pytest.raises(UserError, match="none of these runs has ended with a model that learns an order"):
         diagnose_runs([other])
     model = ["--model", str(model_file), "--env", "FallingBall-v0"]

@@ -83,6 +83,17 @@ def test_norms_are_averaged_not_their_quotients():
     assert balance.weight == pytest.approx(0.1 * 5 * (1 - SMOOTHING) / (2 * (1 - SMOOTHING) + 12))
 
 
+def test_a_norm_that_overflows_does_not_spoil_the_averages():
+    balance = GradientBalance(0.1, CPU)
+    balance.measure(gradients([3.0], [2.0]))
+    for broken in (th.inf, th.nan):
+        balance.measure(gradients([broken], [2.0]))
+        balance.measure(gradients([3.0], [broken]))
+    assert balance.weight == pytest.approx(0.1 * 3 / 2)
+    balance.measure(gradients([3.0], [2.0]))
+    assert balance.weight == pytest.approx(0.1 * 3 / 2)
+
+
 def test_an_objective_without_a_gradient_has_no_weight():
     balance = GradientBalance(0.1, CPU)
     balance.measure(gradients([1.0], [0.0]))

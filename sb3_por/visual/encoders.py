@@ -302,9 +302,7 @@ class CombinedEncoder(Encoder):
         for key, space in observation_space.spaces.items():
             if is_image_space(space, normalized_image=normalized_image):
                 assert space.shape is not None
-                trunks[key], image_dim = make_conv_trunk(
-                    space.shape, n_filters, strides, kernel_sizes, center, spatial_softmax
-                )
+                trunks[key], image_dim = make_conv_trunk(space.shape, *convolutions)
                 image_dims.append(image_dim)
             else:
                 vector_keys.append(key)

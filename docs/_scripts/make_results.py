@@ -169,6 +169,19 @@ def paired(difference: pd.Series) -> tuple[str, str]:
     return f"{mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}]", f"{deviation:.2f}"
 
 
+def last_five(suite: str, reference: str) -> str:
+    """Tabulate the mean of each run's last five evaluations, and the differences to another algorithm with the same seed."""
+    scores = read_scores([RESULTS / suite / "scores.csv"]).sort_values("step")
+    means = scores.groupby(["env", "algo", "seed"])[METRIC].apply(lambda run: run.tail(5).mean()).unstack("seed")
+    rows = []
+    for env_id, algo in means.index:
+        own, other = means.loc[env_id, algo], means.loc[env_id, reference]
+        each = ", ".join("-" if pd.isna(mean) else f"{mean:.2f}" for mean in own)
+        difference = paired(own - other)[0] if algo != reference else "-"
+        rows.append((f"`{env_id}`", f"`{algo}`", paired(own)[0].replace("+", ""), each, difference))
+    return markdown(("", "", "mean", "each seed", f"difference to `{reference}`"), rows)
+
+
 def areas(suite: str) -> str:
     """Tabulate the area under each learning curve, and the differences to lambda = 0 with the same seed."""
     areas = areas_of(suite).pivot(index="algo", columns="seed", values=METRIC)
@@ -424,6 +437,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "pour": lambda: evaluations("pour"),
     "demos": lambda: evaluations("demos"),
     "rope": lambda: evaluations("rope"),
+    "sparse": lambda: evaluations("sparse"),
+    "sparse_last_five": lambda: last_five("sparse", "none"),
     "fold": lambda: evaluations("fold"),
     "fold_comparison": lambda: comparison("fold"),
     "diagnosis_fold": lambda: diagnosis("fold"),

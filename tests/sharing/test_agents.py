@@ -187,4 +187,4 @@ def test_an_agent_goes_by_its_algorithm_too(folder):
     facts = json.loads((folder / "sac_por-PourWater-v0.json").read_text())
     assert find_agent("PourWater-v0", "sac_por", folder).facts == facts
     assert find_agent("PourWater-v0", "worse", folder).facts["class"] == facts["class"] == "SACPOR"
-    assert find_agent("PourWater-v0", "sac_drq").facts["algo"] == "plain"
+    assert find_agent("FoldCloth-v0", "sac_drq").facts["algo"] == "plain"

@@ -182,8 +182,8 @@ def last_five(suite: str, reference: str) -> str:
     return markdown(("", "", "mean", "each seed", f"difference to `{reference}`"), rows)
 
 
-def areas(suite: str) -> str:
-    """Tabulate the area under each learning curve, and the differences to lambda = 0 with the same seed."""
+def areas(suite: str, reference: str = "por_lambda_0") -> str:
+    """Tabulate the area under each learning curve, and the differences to another algorithm with the same seed."""
     areas = areas_of(suite).pivot(index="algo", columns="seed", values=METRIC)
     scores = read_scores([RESULTS / suite / "scores.csv"])
     last = scores[scores["step"] == scores["step"].max()].pivot(index="algo", columns="seed", values=METRIC)
@@ -191,15 +191,15 @@ def areas(suite: str) -> str:
     for algo in areas.mean(axis=1).sort_values(ascending=False).index:
         own = areas.loc[algo]
         differences = ["-"] * 3
-        if algo != "por_lambda_0":
-            differences = [*paired(own - areas.loc["por_lambda_0"]), paired(last.loc[algo] - last.loc["por_lambda_0"])[0]]
+        if algo != reference:
+            differences = [*paired(own - areas.loc[reference]), paired(last.loc[algo] - last.loc[reference])[0]]
         each = ", ".join("-" if pd.isna(area) else f"{area:.2f}" for area in own)
         rows.append((f"`{algo}`", f"{own.mean():.2f}", each, *differences))
     head = (
         "",
         "mean area",
         "each seed",
-        "difference to `por_lambda_0`",
+        f"difference to `{reference}`",
         "standard deviation of differences",
         "difference of last scores",
     )
@@ -438,6 +438,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "demos": lambda: evaluations("demos"),
     "rope": lambda: evaluations("rope"),
     "sparse": lambda: evaluations("sparse"),
+    "sparse_areas": lambda: areas("sparse", "none"),
     "sparse_last_five": lambda: last_five("sparse", "none"),
     "fold": lambda: evaluations("fold"),
     "fold_comparison": lambda: comparison("fold"),
@@ -468,7 +469,7 @@ def fill_in(page: str) -> str:
 
 def draw() -> None:
     """Draw the figures of scores and of POR's classifier."""
-    for suite in ("main", "full_speed", "weights", "long", "steady", "rope", "fold", "state", "fair"):
+    for suite in ("main", "full_speed", "weights", "long", "steady", "rope", "fold", "state", "fair", "sparse"):
         scores = read_scores([RESULTS / suite / "scores.csv"])
         plot(scores, "tasks")[0].save(RESULTS / suite / "curves.png")
     for suite in ("main", "full_speed"):

@@ -18,7 +18,7 @@ from sb3_por.analysis.learning_curves import sort_algos
 from sb3_por.analysis.plots import LABELS
 from sb3_por.analysis.por_logs import read_order
 from sb3_por.analysis.saliency import draw_saliency
-from sb3_por.analysis.scores import METRICS, RUN_KEYS, join_runs, read_csv, read_run
+from sb3_por.analysis.scores import METRICS, RUN_KEYS, join_runs, read_csv, read_run, unlike_runs
 from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write, check_writable
 from sb3_por.evaluation.loading import LOADABLE, resolve
@@ -114,7 +114,7 @@ def write_report(
         metric = metric or next((name for name in METRICS if scores[name].notna().any()), METRICS[0])
         order, without_logs = read_order([run.folder for run in _evaluated(runs)])
         plots, left_out = plot_all(scores, order, metric, step, seed=seed)
-        notes += without_logs + left_out
+        notes += unlike_runs(run.folder for run in _evaluated(runs)) + without_logs + left_out
         save_all(plots, folder / FIGURES)
         if videos:
             shown = _show_models(_best_runs(runs, scores, metric), notes)

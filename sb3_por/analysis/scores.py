@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,10 +12,19 @@ from sb3_por.analysis.names import METRICS
 from sb3_por.common.errors import UserError, UserNote, one_line
 from sb3_por.common.files import atomic_write
 from sb3_por.runs.facts import control_steps, run_identity
-from sb3_por.runs.folder import find_runs, read_evaluations, run_arguments
+from sb3_por.runs.folder import (
+    HYPERPARAMETERS,
+    find_runs,
+    read_evaluations,
+    read_settings,
+    run_arguments,
+    settings_folder,
+)
 
 #: Columns that identify a run, and columns that an evaluation measures.
 RUN_KEYS = ["env", "algo", "seed"]
+#: Settings in which the seeds of one algorithm may differ: how long they are, and where files were
+PER_RUN = ("n_timesteps", "demos")
 COLUMNS = [*RUN_KEYS, "step", *METRICS, "wall_clock_s", "commit"]
 
 
@@ -30,24 +40,54 @@ def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
     tables = [read_csv(path) for path in given if path.suffix == ".csv"]
     folders = [path for path in given if path.suffix != ".csv"]
     runs = find_runs(folders)
-    _note_unlike_steps(runs)
+    for note in unlike_runs(runs):
+        warnings.warn(note, UserNote)
     return join_runs(tables + [read_run(run) for run in runs])
 
 
-def _note_unlike_steps(runs: Iterable[Path]) -> None:
-    """Tell where runs of a task would share an axis of steps that are not the same."""
+def unlike_runs(runs: Iterable[Path]) -> list[str]:
+    """
+    :param runs: run folders
+    :return: a sentence for each algorithm whose runs have other settings though they count as its seeds, and for each task
+        whose runs share an axis of steps that are not the same
+    """
+    runs = list(runs)
+    return _unlike_settings(runs) + _unlike_steps(runs)
+
+
+def _unlike_settings(runs: Iterable[Path]) -> list[str]:
+    settings: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for run in runs:
+        identity = run_identity(run)
+        one = read_settings(settings_folder(run, identity["env"]) / HYPERPARAMETERS)
+        if one:
+            settings.setdefault((identity["env"], identity["algo"]), []).append(one)
+    notes = []
+    for (env, algo), of_runs in settings.items():
+        names = {name for one in of_runs for name in one if name not in PER_RUN}
+        differ = sorted(name for name in names if any(one.get(name) != of_runs[0].get(name) for one in of_runs))
+        if differ:
+            notes.append(
+                f"the runs of {algo} on {env} count as its seeds, and differ in {', '.join(differ)}: label them apart "
+                "(train.py --label NAME, or label: NAME in the run's args.yml)"
+            )
+    return notes
+
+
+def _unlike_steps(runs: Iterable[Path]) -> list[str]:
     lengths: dict[str, dict[int, str]] = {}
     for run in runs:
         identity = run_identity(run)
         lengths.setdefault(identity["env"], {}).setdefault(control_steps(run), identity["algo"])
+    notes = []
     for env, algos in lengths.items():
         if len(algos) > 1:
             told = ", ".join(f"{n} of {algo}" for n, algo in sorted(algos.items()))
-            warnings.warn(
+            notes.append(
                 f"on {env} an agent's step is not the same number of control steps ({told}): compare runs that hold "
-                "actions for as long (ActionRepeat)",
-                UserNote,
+                "actions for as long (ActionRepeat)"
             )
+    return notes
 
 
 def join_runs(tables: list[pd.DataFrame]) -> pd.DataFrame:

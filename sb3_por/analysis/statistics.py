@@ -40,13 +40,16 @@ def iqm_curves(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     :param seed: seed of the bootstrap; the same scores and seed give the same intervals
     :return: columns algo, step, iqm, low, high, seeds (of each task), tasks, envs (their names)
     """
-    tables = []
+    _note_single_seeds(grid)
+    tables, envs = [], {algo: frozenset(curve.env for curve in grid.of(algo)) for algo in grid.algos}
+    if len(set(envs.values())) > 1:
+        grid.note("the algorithms were not run on the same tasks, so their means are of different ones; see --kind tasks")
     for algo in grid.algos:
         steps, matrix = grid.matrix(algo)
         value, low, high = _interval(matrix, iqm, reps, seed)
         n_seeds, n_tasks, _ = matrix.shape
         columns = {"algo": algo, "step": steps, "iqm": value, "low": low, "high": high, "seeds": n_seeds, "tasks": n_tasks}
-        tables.append(pd.DataFrame({**columns, "envs": " ".join(sorted({curve.env for curve in grid.of(algo)}))}))
+        tables.append(pd.DataFrame({**columns, "envs": " ".join(sorted(envs[algo]))}))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -100,6 +103,7 @@ def aggregates(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
 
     :return: columns algo, statistic, value, low, high, step, seeds, tasks
     """
+    _note_single_seeds(grid)
     step, matrices = grid.last()
     names = ["IQM", "mean"] + (["optimality gap"] if grid.metric in UNIT_METRICS else [])
 
@@ -120,6 +124,7 @@ def performance_profiles(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.Data
 
     :return: columns algo, threshold, fraction, low, high, step, seeds, tasks
     """
+    _note_single_seeds(grid)
     step, matrices = grid.last()
     all_scores = np.concatenate([matrix.ravel() for matrix in matrices.values()])
     low, high = (0.0, 1.0) if grid.metric in UNIT_METRICS else (float(all_scores.min()), float(all_scores.max()))
@@ -158,6 +163,7 @@ def improvements(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     :return: columns algo, rival, probability (that algo beats rival), low, high, step, seeds (the smaller number of both),
         tasks; no rows for a single algorithm
     """
+    _note_single_seeds(grid)
     step, matrices = grid.last()
     pairs = list(combinations(grid.algos, 2))
     columns = ["algo", "rival", "probability", "low", "high", "step", "seeds", "tasks"]
@@ -218,6 +224,12 @@ def _ratios(*scores: np.ndarray) -> np.ndarray:
     best = np.array([means[_best_rival(means, i)] for i in range(len(means))])
     undefined = np.where(means > 0, np.inf, np.nan)
     return np.divide(means, best, out=undefined, where=best > 0)
+
+
+def _note_single_seeds(grid: Grid) -> None:
+    single = [algo for algo in grid.algos if any(len(grid.of(algo, env)) == 1 for env in grid.envs)]
+    if single:
+        grid.note(f"one seed of {' and '.join(single)}: an interval over seeds has no width then, and tells nothing")
 
 
 def _interval(

@@ -18,6 +18,8 @@ from softbody_envs.variations import SPLITS
 
 #: Seed of the first evaluation episode; the k-th has this plus k.
 EVAL_SEED = 0
+#: What is added to the seeds of training episodes where no variation tells them from those of evaluations
+TRAINING_SEED = 1_000_000
 
 
 class Model(Protocol):
@@ -155,11 +157,13 @@ def training_episodes(env_id: str, n_episodes: int, seed: int) -> list[Episode]:
     :param env_id: Gymnasium id
     :param n_episodes: Number of episodes
     :param seed: Chooses the scenes
-    :return: Episodes in training scenes drawn without replacement, as long as there are any left
+    :return: Episodes in training scenes drawn without replacement, as long as there are any left. In environments without
+        variations the seeds are far from those of evaluations, since the seed is all that tells one episode from another
     """
-    train, has_variations = SPLITS["train"], task_class(env_id) is not None
-    order = np.random.default_rng(seed).permutation(train)
-    return [Episode(k, seed + k, int(order[k % len(order)]) if has_variations else None) for k in range(n_episodes)]
+    if task_class(env_id) is None:
+        return [Episode(k, TRAINING_SEED + seed + k, None) for k in range(n_episodes)]
+    scenes = np.random.default_rng(seed).permutation(SPLITS["train"])
+    return [Episode(k, seed + k, int(scenes[k % len(scenes)])) for k in range(n_episodes)]
 
 
 def scene_kwargs(env_id: str, split: str) -> dict[str, Any]:
@@ -171,11 +175,19 @@ def scene_kwargs(env_id: str, split: str) -> dict[str, Any]:
     return {"split": split} if task_class(env_id) is not None else {}
 
 
-def whole_episodes(env_kwargs: dict[str, Any]) -> dict[str, Any]:
+def whole_episodes(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
     """
     A training environment's arguments as evaluation takes them. Training episodes may be cut short (so that a picker that
-    has gone astray starts again); what is scored is whole.
+    has gone astray starts again); what is scored is whole. An environment that has no limit of its own keeps that of training:
+    its episodes might never end.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: Arguments of the training environment
+    :return: Arguments of an evaluation environment
     """
+    spec = gym.registry.get(env_id)
+    if spec is None or spec.max_episode_steps is None:
+        return env_kwargs
     return {name: value for name, value in env_kwargs.items() if name != "max_episode_steps"}
 
 

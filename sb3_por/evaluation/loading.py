@@ -28,11 +28,15 @@ from sb3_por.runs.folder import (
     HYPERPARAMETERS,
     STATISTICS,
     import_names,
+    last_model,
     read_settings,
     run_arguments,
+    settings_folder,
 )
 from sb3_por.runs.origin import note_foreign
 
+#: Note on a model of which too little is known; takes the model and the environment
+NO_WRAPPERS = "{} does not tell how its environment was wrapped: {} is made without wrappers"
 #: Most stacked frames of a stranger's model
 MAX_FRAMES = 64
 
@@ -126,8 +130,10 @@ def resolve(
             environment = trained_in(path, env_id)
             model = load_model(path, algo)
     else:
-        quiet = bool(given) or env_kwargs is not None
-        environment = _arguments(TrainingEnvironment.of_model(model), env_id, None, quiet)
+        quiet, made_of = bool(given) or env_kwargs is not None, TrainingEnvironment.of_model(model)
+        if made_of is None and isinstance(model, BaseAlgorithm) and not quiet:
+            warnings.warn(NO_WRAPPERS.format("the model", env_id), UserNote)
+        environment = _arguments(made_of, env_id, None, quiet)
     if environment["env_kwargs"] is None:
         environment["env_kwargs"] = observation_kwargs(env_id, model.observation_space)
     environment["env_kwargs"] = environment["env_kwargs"] | (env_kwargs or {})
@@ -141,7 +147,7 @@ def _load_safe(path: Path, env_id: str, environment: dict[str, Any], algo: str |
     wrappers = environment["env_wrapper"], environment["vec_env_wrapper"]
     env = make_wrapped(env_id, environment["env_kwargs"] or {}, *wrappers)
     try:
-        n_frames = read_settings(path.parent / env_id.rpartition(":")[2] / HYPERPARAMETERS).get("frame_stack") or 1
+        n_frames = read_settings(settings_folder(path.parent, env_id) / HYPERPARAMETERS).get("frame_stack") or 1
         if not isinstance(n_frames, int) or not 1 <= n_frames <= MAX_FRAMES:
             raise UserError(f"frame_stack is refused: {short(n_frames)} is no number from 1 to {MAX_FRAMES}")
         return load_safe(path, VecFrameStack(env, n_frames) if n_frames > 1 else env, algo=algo)
@@ -159,20 +165,22 @@ def trained_in(path: str | Path, env_id: str, safe: bool = False) -> dict[str, A
     :raises UserError: If a wrapper cannot be imported, or something is refused
     """
     file = model_file(path)
-    folder = file.parent / env_id.rpartition(":")[2]
+    folder = settings_folder(file.parent, env_id)
     settings = read_settings(folder / HYPERPARAMETERS)
     if settings:
         # The RL Zoo has the arguments of the command line in its other file alone
         given = read_settings(folder / ARGUMENTS).get("env_kwargs") or {}
         settings["env_kwargs"] = {**(settings.get("env_kwargs") or {}), **given}
-        made_of: TrainingEnvironment | None = TrainingEnvironment.of_settings(folder.name, settings)
+        made_of: TrainingEnvironment | None = TrainingEnvironment.of_settings(env_id.rpartition(":")[2], settings)
     else:
         made_of = TrainingEnvironment.of_data(plain_files.read_json(file) if safe else read_data(file))
         if made_of is None:
-            warnings.warn(f"{file} does not tell how its environment was wrapped: {env_id} is made without wrappers", UserNote)
+            warnings.warn(NO_WRAPPERS.format(file, env_id), UserNote)
     of_best = folder / BEST_STATISTICS
     pickled = of_best if file.name == BEST_MODEL and of_best.is_file() else folder / STATISTICS
     statistics = pickled if pickled.is_file() else None
+    if statistics is not None and file.name not in (BEST_MODEL, last_model(env_id)):
+        warnings.warn(f"{file} plays with the statistics of observations of the run's end, {pickled}", UserNote)
     if safe and made_of is not None:
         check_environment(made_of)
     if safe or statistics is None:
@@ -196,7 +204,7 @@ def _arguments(
         return arguments
     missing = made_of.normalizes_observations and statistics is None
     if made_of.env_id == env_id.rpartition(":")[2]:
-        arguments["env_kwargs"] = whole_episodes(import_names(made_of.env_kwargs or {}))
+        arguments["env_kwargs"] = whole_episodes(made_of.env_id, import_names(made_of.env_kwargs or {}))
         arguments["env_wrapper"] = import_wrappers(without_ranker(made_of.env_wrapper))
         arguments["vec_env_wrapper"] = import_wrappers(made_of.vec_env_wrapper)
         missing = missing or bool(made_of.unknown)

@@ -18,7 +18,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_por.common.files import DiskError, atomic_write, disk_errors
 from sb3_por.common.random_state import get_rng_state
-from sb3_por.runs.folder import CHECKPOINTS, MONITORS, STATISTICS, discard, latest_checkpoint
+from sb3_por.runs.folder import CHECKPOINTS, MONITORS, STATISTICS, discard, latest_checkpoint, settings_folder
 
 #: Model in the folder of a checkpoint
 MODEL = "model.zip"
@@ -74,8 +74,9 @@ def _write_checkpoint(model: BaseAlgorithm, run: Path, env_id: str, seconds: flo
         _write_buffer(buffer, temporary, root / BLOCKS)
     statistics = model.get_vec_normalize_env()
     if statistics is not None:
-        (temporary / env_id).mkdir()
-        statistics.save(str(temporary / env_id / STATISTICS))
+        folder = settings_folder(temporary, env_id)
+        folder.mkdir()
+        statistics.save(str(folder / STATISTICS))
     for file in temporary.rglob("*"):
         if file.is_file():
             with open(file, "rb") as opened:

@@ -18,6 +18,7 @@ from sb3_por.runs.folder import (
     read_evaluations,
     read_settings,
     run_arguments,
+    settings_folder,
 )
 from sb3_por.runs.lock import is_locked
 
@@ -85,7 +86,7 @@ def orphaned_logs(folders: Iterable[str | Path]) -> dict[Path, list[str]]:
 def _facts(run: Path) -> RunFacts:
     arguments = run_arguments(run)
     identity = run_identity(run)
-    config = read_settings(run / identity["env"] / HYPERPARAMETERS)
+    config = read_settings(settings_folder(run, identity["env"]) / HYPERPARAMETERS)
     # -1 is the zoo's "as many as the settings say".
     planned = next((n for n in (arguments.get("n_timesteps"), config.get("n_timesteps")) if n and n > 0), None)
     finished = is_finished(run, identity["env"])
@@ -128,7 +129,7 @@ def control_steps(run: Path) -> int:
     :param run: A run folder
     :return: Control steps of an agent's step, of which its monitors count the former, since they are inside ``ActionRepeat``
     """
-    wrappers = read_settings(run / run_identity(run)["env"] / HYPERPARAMETERS).get("env_wrapper")
+    wrappers = read_settings(settings_folder(run, run_identity(run)["env"]) / HYPERPARAMETERS).get("env_wrapper")
     entries = wrappers if isinstance(wrappers, list) else [wrappers]
     held = [entry[ACTION_REPEAT] for entry in entries if isinstance(entry, dict) and ACTION_REPEAT in entry]
     return math.prod(int(arguments["repeat"]) for arguments in held)

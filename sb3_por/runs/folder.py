@@ -44,9 +44,19 @@ COMMAND = "command.txt"
 STATISTICS, BEST_STATISTICS = "vecnormalize.pkl", "best_vecnormalize.pkl"
 
 
+def env_name(env_id: str) -> str:
+    """An environment's id as the RL Zoo names files and folders by it: ``my_package:ns/Mine-v0`` becomes ``ns-Mine-v0``."""
+    return env_id.rpartition(":")[2].replace("/", "-")
+
+
+def settings_folder(run: Path, env_id: str) -> Path:
+    """Folder of a run's settings and statistics."""
+    return run / env_name(env_id)
+
+
 def last_model(env_id: str) -> str:
     """Name of the model at the end of a run. The file marks a finished run."""
-    return f"{env_id}.zip"
+    return f"{env_name(env_id)}.zip"
 
 
 def intermediate_model(n_steps: int) -> str:

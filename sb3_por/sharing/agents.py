@@ -33,7 +33,7 @@ class Agent:
 
 def agent_name(algo: str, env_id: str) -> str:
     """Name of an agent's files, without a suffix; that of models on the hub."""
-    return f"{algo}-{env_id.replace('/', '-')}"
+    return f"{algo}-{env_id}".replace("/", "-")
 
 
 def find_agent(env_id: str, algo: str | None = None, folder: Path | None = None) -> Agent:

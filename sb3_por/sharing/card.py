@@ -48,7 +48,7 @@ def write_card(run: str | Path, folder: Path, repo: str, n_episodes: int = 10) -
     run = open_run(run)
     arguments, identity = run_arguments(run), run_identity(run)
     env_id = find_environment(identity["env"], run)
-    settings = run / env_id
+    settings = files.settings_folder(run, env_id)
     model, statistics = load_run(run, env_id)
     name = agent_name(arguments.get("algo", identity["algo"]), env_id)
     _write_model(run / files.BEST_MODEL, folder / f"{name}.zip", statistics)

@@ -23,7 +23,7 @@ from sb3_por.evaluation.loading import find_environment, model_file, resolve
 from sb3_por.evaluation.plain_files import describe_statistics, save_plain
 from sb3_por.runs.environment import TrainingEnvironment
 from sb3_por.runs.facts import run_identity
-from sb3_por.runs.folder import COMMAND, HYPERPARAMETERS, last_model, read_settings, run_arguments, the_run
+from sb3_por.runs.folder import COMMAND, HYPERPARAMETERS, last_model, read_settings, run_arguments, settings_folder, the_run
 from sb3_por.runs.provenance import current_machine
 from sb3_por.sharing.agents import Agent, agent_name, describe_evaluation
 
@@ -84,7 +84,7 @@ def load_run(run: Path, env_id: str, last: bool = False) -> tuple[Any, dict[str,
     :raises UserError: If there is no such model
     """
     model, environment = resolve(model_file(run / last_model(env_id)) if last else run, env_id)
-    settings = read_settings(run / env_id / HYPERPARAMETERS)
+    settings = read_settings(settings_folder(run, env_id) / HYPERPARAMETERS)
     TrainingEnvironment.of_settings(env_id, settings).store_in(model)
     env = make_evaluation_env(model, env_id, **environment)
     try:
@@ -101,11 +101,11 @@ def run_facts(run: Path, env_id: str) -> dict[str, Any]:
     :return: JSON values: seed, command, settings, commit and versions, without paths of this machine
     """
     arguments = run_arguments(run)
-    command = run / env_id / COMMAND
+    command = settings_folder(run, env_id) / COMMAND
     return {
         "seed": arguments.get("seed"),
         "command": without_paths(command.read_text()) if command.is_file() else None,
-        "settings": plain(read_settings(run / env_id / HYPERPARAMETERS)),
+        "settings": plain(read_settings(settings_folder(run, env_id) / HYPERPARAMETERS)),
         "commit": arguments.get("commit"),
         "machine": current_machine(),
         "versions": {

@@ -76,17 +76,18 @@ def pull(repo: str, folder: str | Path, env: str | None = None, unsafe: bool = F
         arguments = _settings(fetched / files.ARGUMENTS)
         named = arguments["env"] if isinstance(arguments.get("env"), str) else env_name
         env_id = find_environment(env or named.rpartition(":")[2])  # a stranger's package is not imported
-        (run / env_id).mkdir(parents=True)
+        own = files.settings_folder(run, env_id)
+        own.mkdir(parents=True)
         shutil.move(fetched / model, run / files.BEST_MODEL)
         for name in (files.ARGUMENTS, files.HYPERPARAMETERS):
             if settings := _settings(fetched / name):
-                write_settings(run / env_id / name, settings)
+                write_settings(own / name, settings)
         for name in filter(names.__contains__, _SHOWN):
             shutil.move(fetched / name, run / name)
         _take_evaluations(fetched / card.METRICS, run)
         if unsafe:
             if card.PICKLED_STATISTICS in names:
-                shutil.move(fetched / card.PICKLED_STATISTICS, run / env_id / files.STATISTICS)
+                shutil.move(fetched / card.PICKLED_STATISTICS, own / files.STATISTICS)
         else:
             _make_plain(repo, run, env_id, algo, card.PICKLED_STATISTICS in names)
         if folder.exists():

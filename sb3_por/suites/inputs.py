@@ -23,7 +23,7 @@ def run_settings(run: Run) -> dict[str, Any]:
     except UserError:
         settings = {}
     pairs = run.flags[run.flags.index("-params") + 1 :] if "-params" in run.flags else ()
-    return changed(settings, {name: ast.literal_eval(value) for name, _, value in (pair.partition(":") for pair in pairs)})
+    return changed(settings, {name: _python(value) for name, _, value in (pair.partition(":") for pair in pairs)})
 
 
 def check_inputs(runs: Sequence[Run]) -> None:
@@ -42,5 +42,14 @@ def check_inputs(runs: Sequence[Run]) -> None:
 
 def _inputs(run: Run) -> list[Path]:
     """Files and folders that the run's flags and settings name."""
-    demos = [run.flags[run.flags.index("--demos") + 1]] if "--demos" in run.flags else []
-    return [Path(name) for name in [*demos, *rankers(run_settings(run).get("env_wrapper"))]]
+    settings = run_settings(run)
+    demos = run.flags[run.flags.index("--demos") + 1] if "--demos" in run.flags else settings.get("demos")
+    return [Path(name) for name in [*([demos] if isinstance(demos, str) else []), *rankers(settings.get("env_wrapper"))]]
+
+
+def _python(text: str) -> Any:
+    """A value of a flag; the text itself for what is no literal, such as inf: the run refuses it."""
+    try:
+        return ast.literal_eval(text)
+    except ValueError:
+        return text

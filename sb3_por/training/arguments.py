@@ -23,7 +23,16 @@ from sb3_por.runs.checkpoints import (
     latest_checkpoint,
     remove_checkpoints,
 )
-from sb3_por.runs.folder import ARGUMENTS, import_names, last_model, run_arguments, the_run
+from sb3_por.runs.folder import (
+    ARGUMENTS,
+    HYPERPARAMETERS,
+    import_names,
+    last_model,
+    read_settings,
+    run_arguments,
+    settings_folder,
+    the_run,
+)
 from sb3_por.runs.provenance import current_machine, current_provenance
 from sb3_por.runs.versions import current_commit, differences
 from sb3_por.training.hyperparameters import hyperparameter_file, read_hyperparameters
@@ -135,7 +144,7 @@ class Parser(argparse.ArgumentParser):
         args.env = find_environment(args.env)
         if args.trained_agent:
             args.trained_agent = str(model_file(args.trained_agent))
-            read_data(Path(args.trained_agent))
+            _check_networks(args.hyperparams, read_data(Path(args.trained_agent)))
         args.conf_file = args.conf_file or str(hyperparameter_file(args.algo, args.env, bool(args.demos)))
         if args.conf_file.endswith((".yml", ".yaml")):
             read_hyperparameters(args.conf_file, args.env)  # refuses what the zoo takes apart without a look
@@ -165,6 +174,8 @@ class Parser(argparse.ArgumentParser):
         if not args.log_folder:
             self.error("-f needs the name of a folder")
         check_ranker(args)
+        if args.label and ("/" in args.label or "\\" in args.label):
+            self.error(f"--label names files: it may hold no slashes, got {args.label}")
 
     def _resumed(self, run: Path) -> argparse.Namespace:
         """The arguments that a run was started with, changed by those given now."""
@@ -178,6 +189,10 @@ class Parser(argparse.ArgumentParser):
         for name in ("algo", "env"):
             if getattr(args, name).rpartition(":")[2] != saved.get(name):
                 raise UserError(f"--resume continues {saved.get('algo')} on {saved['env']}; leave out --{name}")
+        if args.seed != saved.get("seed", args.seed):
+            raise UserError(f"--resume continues a run of seed {saved['seed']}; leave out --seed")
+        settings = read_settings(settings_folder(run, saved["env"]) / HYPERPARAMETERS)
+        _check_networks(args.hyperparams, import_names(settings))
         if args.optimize_hyperparameters:
             raise UserError("--resume continues a run, and -optimize makes many: give one of them")
         self._check(args)
@@ -214,6 +229,17 @@ def check_ranker(args: argparse.Namespace) -> None:
         Ranker.load(args.ranker)
     elif args.ranker_kwargs:
         raise UserError("--ranker-kwargs are about a ranker: give --ranker, too")
+
+
+def _check_networks(changes: dict[str, Any] | None, own: dict[str, Any]) -> None:
+    """
+    :param changes: Settings that were given
+    :param own: Settings that the loaded model was made with, or its attributes
+    :raises UserError: If the former ask for other networks, which the zoo would write down and not make
+    """
+    given, made = (changes or {}).get("policy_kwargs"), own.get("policy_kwargs") or {}
+    if isinstance(given, dict) and any(made.get(name) != value for name, value in given.items()):
+        raise UserError("a loaded model keeps its networks; leave out policy_kwargs")
 
 
 def _choose_threads(args: argparse.Namespace) -> None:

@@ -67,7 +67,7 @@ from sb3_por.training.trials import trial_settings
 from sb3_por.training.workers import WorkerProcesses
 from sb3_por.visual.algorithm import VisualAlgorithm
 
-#: Seed of the first episode by which a search scores a trial; far from those of evaluations
+#: Seed of the episodes by which a search scores a trial; far from those of demonstrations
 SEARCH_SEED = 1_000_000
 
 
@@ -116,7 +116,8 @@ class Experiment(ExperimentManager):
             hyperparams["normalize"] = saved["normalize"] = read_normalization(saved["normalize"])
             check_types(VecNormalize, saved["normalize"] if isinstance(saved["normalize"], dict) else {})
         scenes = scene_kwargs(self.env_name.gym_id, "train" if self.optimize_hyperparameters else "eval")
-        self.eval_env_kwargs = {**whole_episodes(self.env_kwargs), **scenes, **(self._eval_env_kwargs_args or {})}
+        kwargs = whole_episodes(self.env_name.gym_id, self.env_kwargs)
+        self.eval_env_kwargs = {**kwargs, **scenes, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved
 
     def create_log_folder(self) -> None:
@@ -182,8 +183,16 @@ class Experiment(ExperimentManager):
         finally:
             self.env_wrapper = inner
         if eval_env:
-            env.env_method("play", self._scored_episodes())
+            self._deal_out(env)
         return super()._maybe_normalize(env, eval_env)
+
+    def _deal_out(self, env: VecEnv) -> None:
+        """Give each environment as many of the episodes as SB3 counts of it."""
+        episodes, first = self._scored_episodes(), 0
+        for index in range(env.num_envs):
+            share = (len(episodes) + index) // env.num_envs
+            env.env_method("play", episodes[first : first + share], indices=index)
+            first += share
 
     def _scored_episodes(self) -> list[Episode]:
         """Held-out episodes; for a search those of training scenes, so that scores of what it finds are of unseen ones."""

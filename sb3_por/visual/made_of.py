@@ -5,7 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import OrderEnforcing
+from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 #: Wrappers that change neither what a policy sees nor how its actions act, and subclasses; whole episodes are scored
@@ -39,13 +39,16 @@ def made_of(env: VecEnv | None) -> dict[str, Any] | None:
     wrappers: list[gym.Wrapper] = []
     # What gymnasium.make has put inside of OrderEnforcing, it makes again
     while isinstance(inner, gym.Wrapper) and not isinstance(inner, OrderEnforcing):
-        if not any(cls.__name__ in PASSED_OVER for cls in type(inner).__mro__):
+        is_only_end = isinstance(inner, TimeLimit) and not _has_limit(inner)
+        if is_only_end or not any(cls.__name__ in PASSED_OVER for cls in type(inner).__mro__):
             wrappers.insert(0, inner)
         inner = inner.env
     if inner is None or inner.spec is None:
         return None
     known = [wrapper for wrapper in wrappers if _can_be_made(wrapper)]
     kwargs = {name: value for name, value in inner.spec.kwargs.items() if name not in CHOSEN}
+    if known and inner.spec.kwargs.get("render_mode") == "rgb_array":
+        kwargs["render_mode"] = "rgb_array"  # a wrapper may show it to the policy
     return {
         "env_id": inner.spec.id,
         "env_kwargs": {name: value for name, value in kwargs.items() if _is_plain(value)},
@@ -54,6 +57,13 @@ def made_of(env: VecEnv | None) -> dict[str, Any] | None:
         "unknown": [type(wrapper).__name__ for wrapper in wrappers if wrapper not in known]
         + [name for name, value in kwargs.items() if not _is_plain(value)],
     }
+
+
+def _has_limit(env: gym.Env) -> bool:
+    """Whether episodes of this id end without a further limit."""
+    spec = env.unwrapped.spec
+    registered = None if spec is None else gym.registry.get(spec.id)
+    return registered is None or registered.max_episode_steps is not None
 
 
 def _can_be_made(wrapper: gym.Wrapper) -> bool:

@@ -7,6 +7,7 @@ import yaml
 from made_runs import STEPS, write_run
 
 from sb3_por.analysis.figures import plot
+from sb3_por.analysis.report import write_report
 from sb3_por.analysis.scores import COLUMNS, read_csv, read_run, read_scores, write_csv
 from sb3_por.common.errors import UserError
 
@@ -90,6 +91,20 @@ def test_two_runs_with_one_seed_are_refused_even_if_no_step_is_in_both(tmp_path)
     write_run(tmp_path / "twice", seed=1, steps=[150, 250, 350])
     with pytest.raises(UserError, match="two runs of sac_por on PourWater-v0 with seed 1"):
         read_scores([tmp_path])
+
+
+def test_seeds_of_one_algorithm_with_other_settings_are_noted(tmp_path, recwarn):
+    for seed, pairing in ((1, "swap"), (2, "swap"), (3, "paper")):
+        run = write_run(tmp_path, seed=seed)
+        settings = {"pairing": pairing, "gamma": 0.9, "n_timesteps": 100 * seed}
+        (run / "PourWater-v0" / "config.yml").write_text(yaml.safe_dump(settings))
+    read_scores([tmp_path / "sac_por" / "PourWater-v0_1", tmp_path / "sac_por" / "PourWater-v0_2"])
+    assert not recwarn.list
+    read_scores([tmp_path])
+    (note,) = recwarn.list
+    assert "the runs of sac_por on PourWater-v0 count as its seeds, and differ in pairing: label" in str(note.message)
+    page = write_report([tmp_path], tmp_path / "report", videos=False).read_text()
+    assert "differ in pairing" in page
 
 
 def test_steps_of_different_lengths_are_noted(tmp_path, recwarn):

@@ -158,6 +158,9 @@ def test_a_suite_without_what_its_runs_read_starts_none(suite_file, tmp_path, mo
         assert main(["suite", str(file)]) == 2
         assert named in capsys.readouterr().err and not Path("runs").exists()
     assert main(["suite", str(file), "--dry-run"]) == 0
+    text = "algos: [sac_drq]\nenvs: [PourWater-v0]\nseeds: [0]\nhyperparams: {demos: nowhere, max_grad_norm: .inf}\n"
+    assert main(["suite", str(suite_file(text))]) == 2
+    assert "not there: nowhere (of PourWater-v0/sac_drq/seed_0)" in capsys.readouterr().err
 
 
 def test_the_suites_that_come_along_are_sound():

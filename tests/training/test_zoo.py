@@ -178,6 +178,7 @@ def test_runs_started_together_get_folders_of_their_own(tmp_path, monkeypatch):
         (["-tb", "/proc/tb"], "cannot write in /proc/tb"),
         (["-n", "0"], "--n-timesteps must be at least 1, got 0"),
         (["--eval-episodes", "0"], "--eval-episodes must be at least 1, got 0"),
+        (["--label", "por/paper"], "--label names files: it may hold no slashes, got por/paper"),
         (["--n-eval-envs", "-1"], "--n-eval-envs must be at least 1, got -1"),
         (["--seed", str(2**32)], "--seed must be between 0 and 4294967295"),
         (["--num-threads", "-2"], "--num-threads must be at least 1, got -2"),
@@ -251,6 +252,21 @@ def test_a_search_does_not_see_the_held_out_episodes(tmp_path, monkeypatch):
     for split, episodes in (("train", searched), ("eval", held_out)):
         assert {one.variation for one in episodes} <= set(SPLITS[split])
     assert len(searched) == 3 and not {one.seed for one in searched} & {one.seed for one in held_out}
+
+
+def test_a_search_deals_its_episodes_out(tmp_path, monkeypatch):
+    seen, reset = [], FixedEpisodes.reset
+
+    def note(env, **how):
+        result = reset(env, **how)
+        seen.append((id(env), env._current.seed))
+        return result
+
+    monkeypatch.setattr(FixedEpisodes, "reset", note)
+    flags = ["-optimize", "--n-trials", "1", "--no-optim-plots", "--n-evaluations", "1", "-n", "60", "-f", str(tmp_path)]
+    assert main([*PENDULUM, "--eval-episodes", "5", "--n-eval-envs", "2", *flags, *SMALL]) == 0
+    shares = [{seed - 2_000_000 for one, seed in seen if one == env} for env in dict.fromkeys(env for env, _ in seen)]
+    assert shares == [{0, 1}, {2, 3, 4}]
 
 
 def test_training_that_diverges_is_one_line_and_keeps_the_checkpoints(tmp_path, capsys):

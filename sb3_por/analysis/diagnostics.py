@@ -101,11 +101,13 @@ class Diagnosis:
             "leak control (k = 0)": (self.leak_loss, self.leak_accuracy),
             "chance": (np.log(2), 0.5),
         }
+        # A weight that balances gradients is not in what safe loading reads
+        of_por = "unknown (loaded safely)" if np.isnan(self.grad_norm_por) else f"{self.grad_norm_por:.3g}"
         orders = {ORDERS[name]: [getattr(order, measure) for measure in MEASURES] for name, order in self.orders.items()}
         return "\n".join(
             (
                 _printed(pairs, ("loss", "accuracy")),
-                f"gradient norm with respect to the encoder: critic {self.grad_norm_critic:.3g}, POR {self.grad_norm_por:.3g}",
+                f"gradient norm with respect to the encoder: critic {self.grad_norm_critic:.3g}, POR {of_por}",
                 f"standard deviation of the encoder's features over frames: {self.feature_std:.3g}",
                 "",
                 "Spearman correlation r with the monotone quantity, and accuracy on pairs:",

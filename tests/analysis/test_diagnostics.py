@@ -21,6 +21,7 @@ from sb3_por.analysis.diagnostics import diagnose, diagnose_runs
 from sb3_por.analysis.fresh_heads import judgement, train_head
 from sb3_por.analysis.saliency import overlay, saliency_map
 from sb3_por.common.errors import UserError
+from sb3_por.evaluation import load_safe
 from sb3_por.evaluation.loading import load_model
 from sb3_por.objectives.base import EncodedBatch
 from sb3_por.objectives.por import PartialOrder
@@ -47,6 +48,16 @@ def test_an_untrained_classifier_is_at_chance_and_leaks_nothing(model):
     assert 0 <= diagnosis.accuracy <= 1 and 0 <= diagnosis.random_accuracy <= 1
     assert diagnosis.grad_norm_critic > 0 and diagnosis.grad_norm_por > 0
     assert diagnosis.as_dict() == diagnose(model, "FallingBall-v0", n_episodes=1).as_dict()
+
+
+def test_a_balanced_weight_that_safe_loading_does_not_read_is_named(tmp_path):
+    env = gym.make("FallingBall-v0", image_size=36)
+    model = SACPOR("CnnPolicy", env, buffer_size=60, learning_starts=20, batch_size=4, por_coef="auto_0.1", seed=0).learn(25)
+    model.save(tmp_path / "model.zip")
+    trusted, safe = (load(tmp_path / "model.zip") for load in (load_model, load_safe))
+    assert "POR unknown" not in str(diagnose(trusted, "FallingBall-v0", n_episodes=1))
+    diagnosis = diagnose(safe, "FallingBall-v0", n_episodes=1)
+    assert "POR unknown (loaded safely)" in str(diagnosis) and diagnosis.as_dict()["grad_norm_por"] is None
 
 
 def test_a_potential_that_follows_the_ball_has_correlation_one(model, monkeypatch):

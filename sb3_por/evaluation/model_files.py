@@ -31,8 +31,9 @@ def model_file(path: str | Path) -> Path:
     path = Path(path)
     if path.is_dir():
         path = the_run(path) / BEST_MODEL
-    if not path.is_file() and (last := sorted(path.parent.glob("*.zip"), key=lambda file: file.stat().st_mtime)):
-        raise UserError(f"there is no model {path}; the newest one there is {last[-1]}")
+        others = sorted(path.parent.glob("*.zip"), key=lambda file: file.stat().st_mtime)
+        if others and not path.is_file():
+            raise UserError(f"there is no {BEST_MODEL} in {path.parent}: no evaluation; the newest model is {others[-1]}")
     if not path.is_file():
         raise UserError(
             f"there is no model {path}; give a run's folder such as logs/sac_por/PourWater-v0_1, a .zip that train.py or "

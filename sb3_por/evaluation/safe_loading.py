@@ -42,7 +42,10 @@ WRAPPERS = (
     *(f"softbody_envs.wrappers.{name}" for name in ("ProgressReward", "ShowQuantity", "SuccessReward")),
     *(f"gymnasium.wrappers.{name}" for name in ("ClipAction", "ClipReward", "RescaleAction", "RescaleObservation")),
     *(f"gymnasium.wrappers.{name}" for name in ("FlattenObservation", "GrayscaleObservation", "ResizeObservation")),
-    *(f"gymnasium.wrappers.{name}" for name in ("FrameStackObservation", "MaxAndSkipObservation", "TimeAwareObservation")),
+    *(
+        f"gymnasium.wrappers.{name}"
+        for name in ("FrameStackObservation", "MaxAndSkipObservation", "TimeAwareObservation", "TimeLimit")
+    ),
     *(f"stable_baselines3.common.atari_wrappers.{name}" for name in ("AtariWrapper", "MaxAndSkipEnv", "WarpFrame")),
     "sb3_contrib.common.wrappers.TimeFeatureWrapper",
     "stable_baselines3.common.vec_env.VecFrameStack",
@@ -112,7 +115,10 @@ def check_environment(made_of: TrainingEnvironment) -> None:
             if name not in WRAPPERS:
                 raise UserError(f"the wrapper {short(name)} is refused; safe loading knows {', '.join(WRAPPERS)}")
             _check_values(f"arguments of {name}", arguments or {}, texts=False)
-    _check_values("env_kwargs", made_of.env_kwargs or {}, texts=task_class(made_of.env_id) is not None)
+    kwargs = dict(made_of.env_kwargs or {})
+    if kwargs.get("render_mode") == "rgb_array":
+        del kwargs["render_mode"]  # which every environment knows
+    _check_values("env_kwargs", kwargs, texts=task_class(made_of.env_id) is not None)
 
 
 def _load(path: Path, env: Any, device: th.device | str, algo: str | None) -> BaseAlgorithm:

@@ -5,7 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import OrderEnforcing, TimeLimit
+from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 #: Wrappers that change neither what a policy sees nor how its actions act, and subclasses; whole episodes are scored
@@ -39,7 +39,7 @@ def made_of(env: VecEnv | None) -> dict[str, Any] | None:
     wrappers: list[gym.Wrapper] = []
     # What gymnasium.make has put inside of OrderEnforcing, it makes again
     while isinstance(inner, gym.Wrapper) and not isinstance(inner, OrderEnforcing):
-        is_only_end = isinstance(inner, TimeLimit) and not _has_limit(inner)
+        is_only_end = _is_time_limit(type(inner)) and not _has_limit(inner)
         if is_only_end or not any(cls.__name__ in PASSED_OVER for cls in type(inner).__mro__):
             wrappers.insert(0, inner)
         inner = inner.env
@@ -59,6 +59,11 @@ def made_of(env: VecEnv | None) -> dict[str, Any] | None:
     }
 
 
+def _is_time_limit(cls: type) -> bool:
+    """By its name: the RL Zoo puts a class of its own in the place of Gymnasium's."""
+    return any(one.__name__ == "TimeLimit" for one in cls.__mro__)
+
+
 def _has_limit(env: gym.Env) -> bool:
     """Whether episodes of this id end without a further limit."""
     spec = env.unwrapped.spec
@@ -74,6 +79,8 @@ def _can_be_made(wrapper: gym.Wrapper) -> bool:
 
 def _path(cls: type) -> str:
     """Dotted path as users type it: ``gymnasium.wrappers.ClipReward``."""
+    if _is_time_limit(cls):
+        return "gymnasium.wrappers.TimeLimit"
     is_public = getattr(gym.wrappers, cls.__name__, None) is cls
     return f"gymnasium.wrappers.{cls.__name__}" if is_public else f"{cls.__module__}.{cls.__qualname__}"
 

@@ -11,8 +11,9 @@ from gymnasium.wrappers import AddRenderObservation
 from stable_baselines3 import SAC
 
 from sb3_por import SACDrQ
+from sb3_por.__main__ import main as evaluation_main
 from sb3_por.common.errors import UserNote
-from sb3_por.evaluation import evaluate
+from sb3_por.evaluation import evaluate, load_safe
 from sb3_por.evaluation.episodes import evaluation_episodes, training_episodes
 from sb3_por.evaluation.loading import resolve
 from sb3_por.runs.folder import is_finished
@@ -82,6 +83,13 @@ def test_a_model_between_plays_with_statistics_of_the_end_and_says_so(run):
         resolve(run / "rl_model_15_steps.zip", ENV_ID)
 
 
+def test_a_run_without_evaluations_names_its_last_model(run, capsys):
+    (run / "best_model.zip").unlink()
+    assert evaluation_main(["evaluate", "--model", str(run), "--env", ENV_ID]) == 2
+    error = capsys.readouterr().err
+    assert "there is no best_model.zip in" in error and f"the newest model is {run / 'ours-Line-v0.zip'}" in error
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -100,9 +108,12 @@ def test_a_loaded_agent_keeps_its_networks(line, run, capsys):
     assert "a loaded model keeps its networks" in capsys.readouterr().err
 
 
-def test_where_nothing_else_ends_an_episode_the_limit_of_training_does(line):
+def test_where_nothing_else_ends_an_episode_the_limit_of_training_does(line, tmp_path):
     model = SACDrQ("MlpPolicy", gym.make(ENV_ID, max_episode_steps=10), buffer_size=20, learning_starts=15).learn(12)
     assert evaluate(model, ENV_ID, n_episodes=2).lengths == [10, 10]
+    model.save(tmp_path / "model.zip")
+    safe = load_safe(tmp_path / "model.zip", device="cpu")
+    assert evaluate(safe, ENV_ID, n_episodes=1).lengths == [10]
 
 
 def test_pictures_in_place_of_vectors_can_be_evaluated(line):

@@ -190,6 +190,7 @@ def ratios(grid: Grid, reps: int = REPS, seed: int = 0) -> pd.DataFrame:
     :return: columns env, algo, score, rival, rival_score, ratio, low, high, step, seeds; NaN or infinite where the rival's
         mean is not positive
     """
+    _note_single_seeds(grid)
     algos = [algo for algo in grid.algos if algo not in STATE_ALGOS]
     if set(grid.algos) - set(algos):
         grid.note(f"{' and '.join(STATE_ALGOS)} observes the state, so the ratios leave it out")

@@ -1,4 +1,4 @@
-"""PourWaterAmount: pour water into a cup up to a line."""
+"""PourWaterAmount: pour a wanted amount of water into a cup."""
 
 from typing import ClassVar
 
@@ -12,16 +12,16 @@ from softbody_envs.tasks.pour_water import PourWaterEnv
 
 #: Fraction of a filled volume that the spheres occupy after they were poured.
 PACKING = 0.55
-#: Thickness of the line, m: at least a pixel of a 64-pixel image.
-BAR_WIDTH = 0.028
+#: Thickness of the mark on the back wall, m
+THICKNESS = 0.006
 
 
 class PourWaterAmountEnv(PourWaterEnv):
     """
     ## Description
 
-    Pour water from a cup into the target, as in `PourWater-v0`, but only up to the red line on the back wall of the
-    target. Poured water cannot be taken back.
+    Pour water from a cup into the target, as in `PourWater-v0`, but only as much as the back wall of the target says: its
+    red part is to the whole wall as the water to pour is to all water. Poured water cannot be taken back.
 
     ## Action Space
 
@@ -40,7 +40,7 @@ class PourWaterAmountEnv(PourWaterEnv):
 
     | Num | Observation | Unit |
     |-----|-------------|------|
-    | 13 | height of the line | m |
+    | 13 | height of the surface of the wanted water in the target | m |
     | 14 | goal: fraction of the water to pour | 1 |
 
     ## Rewards
@@ -56,8 +56,8 @@ class PourWaterAmountEnv(PourWaterEnv):
 
     ## Starting State
 
-    As in `PourWater-v0`. The goal is drawn from U(0.2, 1) for each variation and rounded down to whole particles. The line
-    is at the height to which that number of loosely packed spheres fills the target.
+    As in `PourWater-v0`. The goal is drawn from U(0.2, 1) for each variation and rounded down to whole particles. The
+    back wall of the target is red from the floor up to that fraction of its height.
 
     ## Episode End
 
@@ -75,7 +75,9 @@ class PourWaterAmountEnv(PourWaterEnv):
       so that its highest score is t / (1 + t) for the goal t.
     * Each variation has its own goal. SoftGym draws one for all variations.
     * The state contains the fractions of the water in target and cup.
-    * The line is on the back wall, where the camera sees it from the start. In SoftGym it is on the left wall.
+    * SoftGym marks the surface of the wanted water by a bar on the left wall. A hundred spheres fill a cup less than
+      SoftGym's water does: from one goal to another their surface moves by 5 cm, two pixels of a 64-pixel image. So the goal
+      is told by how much of the back wall is red, which moves by 13 to 25 cm.
 
     ## Version History
 
@@ -84,7 +86,7 @@ class PourWaterAmountEnv(PourWaterEnv):
 
     scenes: ClassVar[str] = "PourWaterAmountEnv"
     expert: ClassVar[str | None] = "softbody_envs.experts.pour_water:PourWaterAmountExpert"
-    state_names: ClassVar[tuple[str, ...]] = (*PourWaterEnv.state_names, "line height", "target fraction")
+    state_names: ClassVar[tuple[str, ...]] = (*PourWaterEnv.state_names, "wanted height", "target fraction")
     best_performance: ClassVar[float] = 0.0
 
     def _build(self, world: World, rng: np.random.Generator) -> None:
@@ -92,16 +94,17 @@ class PourWaterAmountEnv(PourWaterEnv):
         n = len(self.water)
         self.n_wanted = int(rng.uniform(0.2, 1.0) * n)
         size = self.target.size
-        self.line = WALL + self.n_wanted * VOLUME / (PACKING * size.length * size.width)
-        bar = world.client.createVisualShape(
-            pybullet.GEOM_BOX, halfExtents=(size.length / 2, 0.003, BAR_WIDTH / 2), rgbaColor=(1.0, 0.0, 0.0, 1.0)
+        #: Height to which the wanted number of loosely packed spheres fills the target, m
+        self.wanted_height = WALL + self.n_wanted * VOLUME / (PACKING * size.length * size.width)
+        half = self.n_wanted / n * size.height / 2
+        mark = world.client.createVisualShape(
+            pybullet.GEOM_BOX, halfExtents=(size.length / 2, THICKNESS / 2, half), rgbaColor=(1.0, 0.0, 0.0, 1.0)
         )
-        world.client.createMultiBody(
-            0, baseVisualShapeIndex=bar, basePosition=(self.target.x, size.width / 2 - 0.003, self.line)
-        )
+        place = (self.target.x, (size.width - THICKNESS) / 2, WALL + half)
+        world.client.createMultiBody(0, baseVisualShapeIndex=mark, basePosition=place)
 
     def _measure(self) -> np.ndarray:
-        return np.append(super()._measure(), [self.line, self.n_wanted / len(self.water)])
+        return np.append(super()._measure(), [self.wanted_height, self.n_wanted / len(self.water)])
 
     def performance(self) -> float:
         """Minus the difference between the fraction of the water in the target and the goal."""

@@ -193,10 +193,24 @@ def test_amount_is_drawn_for_each_variation_and_one_is_reachable():
     assert 0.15 <= min(wanted) and max(wanted) <= 1.0 and len(set(wanted)) > 8
 
 
-def test_the_line_is_red_in_the_image_and_as_high_as_the_wanted_water():
+def red_rows(env, size=64):
+    image = env._image(size).astype(int)
+    return ((image[..., 0] > 150) & (image[..., 1] < 60)).any(axis=1).sum()
+
+
+def test_the_share_of_the_back_wall_that_is_red_tells_the_goal():
+    env = make("PourWaterAmount-v0")
+    seen, told = [], []
+    for variation in range(800, 812):
+        env.reset(options={"variation": variation})
+        seen.append(red_rows(env) / env.target.size.height)
+        told.append(env.state()[-1])
+    assert np.corrcoef(seen, told)[0, 1] > 0.95
+    assert max(told) - min(told) > 0.5
+
+
+def test_the_wanted_water_rises_to_the_wanted_height_and_leaves_red_wall_above_it():
     env = make("PourWaterAmount-v0", variation=803)
-    image = env._image(64).astype(int)
-    assert ((image[..., 0] > 150) & (image[..., 1] < 60)).sum() >= 3
     expert = make_expert("PourWaterAmount-v0")
     expert.reset()
     for _ in range(100):
@@ -204,4 +218,5 @@ def test_the_line_is_red_in_the_image_and_as_high_as_the_wanted_water():
     assert info["normalized_performance"] > 0.9
     inside = env.water.positions()[env.target.contains(env.water.positions())]
     surface = np.sort(inside[:, 2])[-5:].mean() + RADIUS
-    assert abs(surface - env.line) < DIAMETER
+    assert abs(surface - env.wanted_height) < DIAMETER
+    assert red_rows(env) > 0

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import inspect
 import math
 import os
 import sys
@@ -144,7 +145,7 @@ class Parser(argparse.ArgumentParser):
         args.env = find_environment(args.env)
         if args.trained_agent:
             args.trained_agent = str(model_file(args.trained_agent))
-            _check_networks(args.hyperparams, read_data(Path(args.trained_agent)))
+            _check_kept(args.algo, args.hyperparams, read_data(Path(args.trained_agent)))
         args.conf_file = args.conf_file or str(hyperparameter_file(args.algo, args.env, bool(args.demos)))
         if args.conf_file.endswith((".yml", ".yaml")):
             read_hyperparameters(args.conf_file, args.env)  # refuses what the zoo takes apart without a look
@@ -192,7 +193,7 @@ class Parser(argparse.ArgumentParser):
         if args.seed != saved.get("seed", args.seed):
             raise UserError(f"--resume continues a run of seed {saved['seed']}; leave out --seed")
         settings = read_settings(settings_folder(run, saved["env"]) / HYPERPARAMETERS)
-        _check_networks(args.hyperparams, import_names(settings))
+        _check_kept(args.algo, args.hyperparams, import_names(settings))
         if args.optimize_hyperparameters:
             raise UserError("--resume continues a run, and -optimize makes many: give one of them")
         self._check(args)
@@ -231,15 +232,23 @@ def check_ranker(args: argparse.Namespace) -> None:
         raise UserError("--ranker-kwargs are about a ranker: give --ranker, too")
 
 
-def _check_networks(changes: dict[str, Any] | None, own: dict[str, Any]) -> None:
+def _check_kept(algo: str, changes: dict[str, Any] | None, own: dict[str, Any]) -> None:
     """
+    :param algo: Name of the algorithm
     :param changes: Settings that were given
     :param own: Settings that the loaded model was made with, or its attributes
-    :raises UserError: If the former ask for other networks, which the zoo would write down and not make
+    :raises UserError: If the former ask for other networks or another kind of temperature, which the zoo would write down
+        and not make
     """
-    given, made = (changes or {}).get("policy_kwargs"), own.get("policy_kwargs") or {}
+    changes = changes or {}
+    given, made = changes.get("policy_kwargs"), own.get("policy_kwargs") or {}
     if isinstance(given, dict) and any(made.get(name) != value for name, value in given.items()):
         raise UserError("a loaded model keeps its networks; leave out policy_kwargs")
+    if "ent_coef" in changes and algo in ALGOS:
+        default = inspect.signature(ALGOS[algo]).parameters["ent_coef"].default if "ent_coef" not in own else own["ent_coef"]
+        if isinstance(changes["ent_coef"], str) != isinstance(default, str):
+            kind = "learned" if isinstance(default, str) else "fixed"
+            raise UserError(f"the temperature of a loaded model stays {kind}; leave out ent_coef, or give one that is {kind}")
 
 
 def _choose_threads(args: argparse.Namespace) -> None:

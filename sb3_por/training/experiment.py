@@ -261,6 +261,8 @@ class Experiment(ExperimentManager):
         if self._checkpoint:
             restore_buffer(model, self._checkpoint)
         buffer = getattr(model, "replay_buffer", None)
+        if buffer is not None and buffer.n_envs != env.num_envs:
+            raise UserError(f"the replay buffer is of {buffer.n_envs} environments; pass -params n_envs:{buffer.n_envs}")
         if self._extends and buffer is not None and buffer.size() == 0:
             warnings.warn(
                 f"{self.save_path} has no {REPLAY_BUFFER}, which --save-replay-buffer writes: training continues with an "

@@ -108,6 +108,16 @@ def test_a_loaded_agent_keeps_its_networks(line, run, capsys):
     assert "a loaded model keeps its networks" in capsys.readouterr().err
 
 
+def test_a_resumed_run_keeps_its_kind_of_temperature_and_its_number_of_environments(run, capsys):
+    assert main(["--resume", str(run), "-n", "60", "-params", "ent_coef:0.2"]) == 2
+    assert "the temperature of a loaded model stays learned; leave out ent_coef" in capsys.readouterr().err
+    assert main(["--resume", str(run), "-n", "60", "--save-replay-buffer", "-params", SMALL[-1]]) == 0
+    settings = (run / "ours-Line-v0" / "config.yml").read_text()
+    assert main(["--resume", str(run), "-n", "80", "-params", "n_envs:2"]) == 2
+    assert "the replay buffer is of 1 environments; pass -params n_envs:1" in capsys.readouterr().err
+    assert (run / "ours-Line-v0" / "config.yml").read_text() == settings
+
+
 def test_where_nothing_else_ends_an_episode_the_limit_of_training_does(line, tmp_path):
     model = SACDrQ("MlpPolicy", gym.make(ENV_ID, max_episode_steps=10), buffer_size=20, learning_starts=15).learn(12)
     assert evaluate(model, ENV_ID, n_episodes=2).lengths == [10, 10]

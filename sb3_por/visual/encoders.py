@@ -147,43 +147,32 @@ class SpatialSoftmax(nn.Module):
 
 
 def make_conv_trunk(
-    image_shape: tuple[int, ...],
-    n_filters: int,
-    strides: Sequence[int],
-    kernel_sizes: Sequence[int] | None,
-    center: bool,
-    spatial_softmax: bool = False,
+    image_shape: tuple[int, ...], n_filters: int, strides: Sequence[int], center: bool, spatial_softmax: bool = False
 ) -> tuple[nn.Sequential, int]:
     """
-    Convolutions with ReLU, then a flatten or a spatial softmax.
+    3x3 convolutions with ReLU, then a flatten or a spatial softmax.
 
     :param image_shape: ``(channels, height, width)``
     :param n_filters: Filters of each layer
     :param strides: Stride of each layer
-    :param kernel_sizes: Height and width of each layer's kernel; None for 3 each
     :param center: Subtract one half from the images
     :param spatial_softmax: End with a spatial softmax of the last convolution, which has no ReLU then
     :return: The trunk, and the size of its output
-    :raises ValueError: If there are not as many kernels as strides, or the images are too small for them
     """
-    kernel_sizes = [3] * len(strides) if kernel_sizes is None else kernel_sizes
-    if len(kernel_sizes) != len(strides):
-        raise ValueError(f"each convolution has a stride and a kernel: strides {[*strides]}, kernel_sizes {[*kernel_sizes]}")
     layers: list[nn.Module] = []
     n_channels, height, width = image_shape
-    for kernel, stride in zip(kernel_sizes, strides, strict=True):
+    for stride in strides:
         conv_class = CenteredConv2d if center and not layers else nn.Conv2d
-        conv = conv_class(n_channels, n_filters, kernel_size=kernel, stride=stride)
+        conv = conv_class(n_channels, n_filters, kernel_size=3, stride=stride)
         delta_orthogonal_(conv.weight, nn.init.calculate_gain("relu"))
         assert conv.bias is not None
         nn.init.zeros_(conv.bias)
         layers += [conv, nn.ReLU(inplace=True)]  # a second copy of each activation costs more than the function
-        n_channels, height, width = n_filters, (height - kernel) // stride + 1, (width - kernel) // stride + 1
+        n_channels, height, width = n_filters, (height - 3) // stride + 1, (width - 3) // stride + 1
         if min(height, width) < 1:
             raise ValueError(
-                f"Images of {image_shape[1]}x{image_shape[2]} pixels are too small for convolutions of "
-                f"{tuple(kernel_sizes)} pixels with strides {tuple(strides)}: use larger images or fewer and smaller strides "
-                "(features_extractor_kwargs)."
+                f"Images of {image_shape[1]}x{image_shape[2]} pixels are too small for 3x3 convolutions with strides "
+                f"{tuple(strides)}: use larger images or fewer and smaller strides (features_extractor_kwargs)."
             )
     if spatial_softmax:
         layers[-1] = SpatialSoftmax(n_channels, height, width)
@@ -198,7 +187,7 @@ def make_conv_trunk(
 
 class ConvEncoder(Encoder):
     """
-    The convolutional encoder of CURL and DrQ: convolutions, then Linear -> 50 -> LayerNorm -> tanh, as in DrQ. With
+    The convolutional encoder of CURL and DrQ: 3x3 convolutions, then Linear -> 50 -> LayerNorm -> tanh, as in DrQ. With
     ``spatial_softmax`` the features are positions in the image, without a projection; they locate small objects after fewer
     updates.
 
@@ -207,8 +196,6 @@ class ConvEncoder(Encoder):
     :param n_filters: Filters of each convolution
     :param strides: Stride of each convolution. (2, 1, 1, 1) in CURL, DrQ and at the paper's scale;
         the default costs a sixth of it and suits a laptop
-    :param kernel_sizes: Height and width of each convolution's kernel; 3 each by default, as there. A kernel that is smaller
-        than its stride skips pixels
     :param center: Subtract one half from the images, which are in [0, 1] then
     :param spatial_softmax: Use the positions of the last convolution's responses as features (``SpatialSoftmax``)
     :param normalized_image: The space holds images that are normalized already (``normalize_images=False``)
@@ -220,7 +207,6 @@ class ConvEncoder(Encoder):
         features_dim: int = 50,
         n_filters: int = 32,
         strides: Sequence[int] = (2, 2, 2, 1),
-        kernel_sizes: Sequence[int] | None = None,
         center: bool = False,
         spatial_softmax: bool = False,
         normalized_image: bool = False,
@@ -233,7 +219,7 @@ class ConvEncoder(Encoder):
         )
         center = center and not normalized_image
         assert observation_space.shape is not None
-        trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides, kernel_sizes, center, spatial_softmax)
+        trunk, trunk_dim = make_conv_trunk(observation_space.shape, n_filters, strides, center, spatial_softmax)
         block_dims, n_positions = ([], trunk_dim) if spatial_softmax else ([trunk_dim], 0)
         super().__init__(observation_space, block_dims, features_dim, n_positions)
         self.trunk = trunk
@@ -277,7 +263,6 @@ class CombinedEncoder(Encoder):
     :param cnn_output_dim: Size of one projected block (the name is that of SB3's ``CombinedExtractor``)
     :param n_filters: Filters of each convolution
     :param strides: Stride of each convolution, see ``ConvEncoder``
-    :param kernel_sizes: Height and width of each convolution's kernel, see ``ConvEncoder``
     :param hidden_dim: Size of the hidden layer for vectors
     :param center: Subtract one half from the images, which are in [0, 1] then
     :param spatial_softmax: Positions instead of blocks for images, see ``ConvEncoder``
@@ -290,19 +275,18 @@ class CombinedEncoder(Encoder):
         cnn_output_dim: int = 50,
         n_filters: int = 32,
         strides: Sequence[int] = (2, 2, 2, 1),
-        kernel_sizes: Sequence[int] | None = None,
         hidden_dim: int = 256,
         center: bool = False,
         spatial_softmax: bool = False,
         normalized_image: bool = False,
     ):
-        convolutions = (n_filters, strides, kernel_sizes, center and not normalized_image, spatial_softmax)
+        center = center and not normalized_image
         trunks, image_dims, vector_dim = {}, [], 0
         vector_keys = []
         for key, space in observation_space.spaces.items():
             if is_image_space(space, normalized_image=normalized_image):
                 assert space.shape is not None
-                trunks[key], image_dim = make_conv_trunk(space.shape, *convolutions)
+                trunks[key], image_dim = make_conv_trunk(space.shape, n_filters, strides, center, spatial_softmax)
                 image_dims.append(image_dim)
             else:
                 vector_keys.append(key)

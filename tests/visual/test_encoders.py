@@ -149,19 +149,3 @@ def test_spatial_softmax_sees_where_two_equal_dots_are_sooner():
 
     positions, flat = error(spatial_softmax=True), error()
     assert positions < 0.5 * flat, (positions, flat)
-
-
-@pytest.mark.parametrize(("kernel_sizes", "seen"), [(None, 9 / 16), ((4, 3), 1.0)])
-def test_a_kernel_as_large_as_its_stride_sees_every_pixel(kernel_sizes, seen):
-    encoder = ConvEncoder(SPACE, n_filters=4, strides=(4, 1), kernel_sizes=kernel_sizes)
-    side = SPACE.shape[-1] // 4 * 4
-    images = th.rand(1, 3, side, side, requires_grad=True)
-    first = encoder.trunk[0]
-    th.nn.init.ones_(first.weight)
-    first(images).sum().backward()
-    assert (images.grad[0, 0] != 0).float().mean() == pytest.approx(seen)
-
-
-def test_each_convolution_has_a_kernel():
-    with pytest.raises(ValueError, match=r"strides \[4, 2, 1\], kernel_sizes \[4, 3\]"):
-        ConvEncoder(SPACE, strides=[4, 2, 1], kernel_sizes=[4, 3])

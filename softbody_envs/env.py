@@ -143,7 +143,7 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
 
         :param seed: seed of the random generator that draws variations
         :param options: ``{"variation": i}`` with i in 0..999, or nothing
-        :raises ValueError: if an option is unknown or the index is out of range
+        :raises ValueError: if an option is unknown, the index is out of range, or the variation starts solved
         """
         super().reset(seed=seed)
         options = options or {}
@@ -160,6 +160,11 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         self.world.clear()
         self._build(self.world, variation_rng(self.scenes, self.variation))
         self._initial_performance = self.performance()
+        if not self._initial_performance < self.best_performance:
+            raise ValueError(
+                f"variation {self.variation} starts solved, so that its score is undefined: performance() is "
+                f"{self._initial_performance:.3g} at reset, and best_performance is {self.best_performance:.3g}"
+            )
         observation, _, info = self._outcome()
         if self._window is not None:
             self.render()

@@ -74,7 +74,7 @@ class ProgressReward(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Re
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See ``gymnasium.Env.reset``."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._performance = info["normalized_performance"]
+        self._performance = _reported(info, "normalized_performance", self)
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -117,7 +117,7 @@ class ShowQuantity(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Reco
         return self._with_quantity(image, info), float(reward), terminated, truncated, info
 
     def _with_quantity(self, image: Any, info: dict[str, Any]) -> dict[str, Any]:
-        quantity = np.clip([info[self.key]], -STATE_LIMIT, STATE_LIMIT).astype(np.float32)
+        quantity = np.clip([_reported(info, self.key, self)], -STATE_LIMIT, STATE_LIMIT).astype(np.float32)
         return {"image": image, "quantity": quantity}
 
 
@@ -146,7 +146,10 @@ class SuccessReward(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Rec
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See ``gymnasium.Env.step``."""
         observation, _, terminated, truncated, info = self.env.step(action)
-        success = info["is_success"] if self.threshold is None else info["normalized_performance"] >= self.threshold
+        if self.threshold is None:
+            success = _reported(info, "is_success", self)
+        else:
+            success = _reported(info, "normalized_performance", self) >= self.threshold
         return observation, self.scale * float(success), terminated, truncated, info
 
 
@@ -184,7 +187,7 @@ class Distraction(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Recor
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See ``gymnasium.Env.reset``."""
         image, info = self.env.reset(seed=seed, options=options)
-        self._rng = np.random.default_rng(info["variation"])
+        self._rng = np.random.default_rng(_reported(info, "variation", self))
         n = -(-self._size // self.element)
         coarse = self._rng.integers(0, 256, (n, n, 3), dtype=np.uint8)
         self._texture = coarse.repeat(self.element, axis=0).repeat(self.element, axis=1)[: self._size, : self._size]
@@ -208,3 +211,12 @@ class Distraction(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Recor
         y, x = self._rng.integers(0, 2 * self.jitter + 1, 2)
         padded = np.pad(blended, ((self.jitter,) * 2, (self.jitter,) * 2, (0, 0)), mode="edge")
         return padded[y : y + self._size, x : x + self._size].copy()
+
+
+def _reported(info: dict[str, Any], key: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> Any:
+    """
+    :raises gymnasium.error.Error: If the environment does not report it
+    """
+    if key not in info:
+        raise gym.error.Error(f"{type(wrapper).__name__} needs info[{key!r}], which {wrapper.unwrapped} does not report")
+    return info[key]

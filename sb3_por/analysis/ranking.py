@@ -74,11 +74,12 @@ class RankerReport:
 
     def __str__(self) -> str:
         if np.isnan(self.next_frame):
-            return "no video was held out: give at least two"
-        lines = [
-            f"held-out videos: successive frames are ranked right in {self.next_frame:.1%} of the pairs, any two frames in "
-            f"{self.any_frames:.1%} (a clock: 100 %)"
-        ]
+            lines = ["no video was held out: give at least two"]
+        else:
+            lines = [
+                f"held-out videos: successive frames are ranked right in {self.next_frame:.1%} of the pairs, any two frames "
+                f"in {self.any_frames:.1%} (a clock: 100 %)"
+            ]
         for name, one in self.agreement.items():
             lines.append(
                 f"random episodes: rank correlation with {name} {one.at_ends:.2f} over their ends (a clock: 0), "
@@ -167,6 +168,8 @@ def play_at_random(env: gym.Env[Any, np.ndarray], episodes: list[Episode], image
             if done:
                 break
             observation, _, terminated, truncated, info = env.step(env.action_space.sample())
+            if "sim_error" in info:
+                break
             done = terminated or truncated
         videos.append(np.stack(frames))
         infos.append(told)

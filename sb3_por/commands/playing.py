@@ -1,8 +1,9 @@
 """Commands that play episodes: evaluate, enjoy, record, rank."""
 
 import argparse
-from dataclasses import replace
 import json
+from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -148,7 +149,7 @@ def _rank(args: argparse.Namespace) -> None:
     from sb3_por.common.files import check_output
     from sb3_por.evaluation.loading import find_environment
     from sb3_por.ranking.ranker import Ranker
-    from sb3_por.ranking.videos import episode_videos, read_videos
+    from sb3_por.ranking.videos import episode_videos, image_of, read_videos
     from sb3_por.training.record import EXPERT, find_player, make_training_env, play_training_scenes
 
     check_output(args.output, (".npz",))
@@ -165,6 +166,9 @@ def _rank(args: argparse.Namespace) -> None:
         player, environment = find_player(trained or EXPERT, args.env, made_of, args.safe)
         make_env = partial(make_training_env, args.env, environment["env_kwargs"], environment["env_wrapper"])
     if args.model:
+        assert make_env is not None  # a model has --env, see above
+        with closing(make_env()) as env:
+            image_of(env.observation_space)  # says so before anything is played
         recording = play_training_scenes(player, args.env, environment, args.n_episodes, args.seed)
         print(f"videos: {recording.evaluation}")
         videos = episode_videos(recording.episodes, recording.env.observation_space, args.image_size)

@@ -95,8 +95,8 @@ class Evaluation:
 
 def score(normalized_performance: Sequence[float], returns: Sequence[float]) -> float:
     """See :attr:`Evaluation.score`."""
-    mean = float(np.mean(normalized_performance))
-    return float(np.mean(returns)) if np.isnan(mean) else mean
+    told = np.asarray(normalized_performance)
+    return float(np.mean(returns) if np.isnan(told).all() else np.nanmean(told))
 
 
 class FixedEpisodes(gym.Wrapper):

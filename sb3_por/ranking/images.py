@@ -9,6 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 
+from sb3_por.common.errors import UserError
+
 
 def find_image(space: spaces.Space) -> Callable[[Any], np.ndarray] | None:
     """
@@ -33,8 +35,13 @@ def resize(frames: np.ndarray, size: int) -> np.ndarray:
         last three count: those of the newest of stacked frames
     :param size: Height and width of the result in pixels
     :return: uint8, shape ``(n, size, size, 3)``
+    :raises UserError: If these are no such frames
     """
+    if frames.ndim != 4 or frames.dtype != np.uint8 or 0 in frames.shape:
+        raise UserError(f"frames are uint8 of (n, height, width, channels), not {frames.dtype} of {frames.shape}")
     channels = frames.shape[3]
+    if channels > 4 and frames.shape[1] in (1, 3, 4):
+        raise UserError(f"the channels of frames come last: (n, height, width, channels), not {frames.shape}")
     rgb = frames[..., -3:] if channels > 4 else np.repeat(frames[..., :1], 3, axis=3) if channels < 3 else frames[..., :3]
     if rgb.shape[1:3] == (size, size):
         return np.ascontiguousarray(rgb)

@@ -23,6 +23,9 @@ SUFFIX = ".npz"
 MAX_BYTES, MIN_SIZE, MAX_SIZE = 64 * 2**20, 32, 256
 #: Images that pass the encoder at once
 CHUNK = 256
+#: Smallest rise of the raw potential from the first to the last frame of a video, and its smallest share of the range within
+#: one: below is what rounding makes of videos that end as they begin
+MIN_RISE, MIN_SHARE = 1e-4, 0.01
 
 
 class Ranker(nn.Module):
@@ -78,10 +81,13 @@ class Ranker(nn.Module):
         with th.no_grad():
             self.start.zero_()
             self.rise.fill_(1.0)
-        ends = np.array([self.potential(video[[0, -1]]) for video in videos])
-        start, end = ends.mean(axis=0)
-        if not end - start > 0:
-            raise UserError("nothing was learned: the potential does not rise along the videos; give more videos or updates")
+        potentials = [self.potential(video) for video in videos]
+        start, end = np.mean([(along[0], along[-1]) for along in potentials], axis=0)
+        if not end - start > max(MIN_RISE, MIN_SHARE * np.mean([np.ptp(along) for along in potentials])):
+            raise UserError(
+                "nothing was learned: the potential does not rise along the videos; give more videos or updates, unless the "
+                "videos end as they begin: then cut them where the task is done"
+            )
         with th.no_grad():
             self.start.fill_(float(start))
             self.rise.fill_(float(end - start))

@@ -1,7 +1,8 @@
 """Videos to learn from: Minari datasets, and folders of .mp4, .gif and .npz files."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
@@ -12,6 +13,8 @@ from sb3_por.demonstrations.dataset import METADATA, Demonstrations, RecordedEpi
 from sb3_por.ranking.images import find_image, resize
 
 SUFFIXES = (".gif", ".mp4", ".npz")
+#: Characters of a decoder's error that are shown
+LONGEST_REASON = 200
 
 
 def read_videos(path: str | Path, image_size: int = 64) -> list[np.ndarray]:
@@ -28,7 +31,7 @@ def read_videos(path: str | Path, image_size: int = 64) -> list[np.ndarray]:
         return episode_videos(dataset.episodes(), dataset.observation_space, image_size)
     if not path.is_dir():
         raise UserError(f"{path} is no folder of videos" if path.exists() else f"there is no folder {path}")
-    files = sorted(file for file in path.glob("*") if file.suffix.lower() in SUFFIXES)
+    files = sorted(file for file in path.glob("*") if file.suffix.lower() in SUFFIXES and file.is_file())
     if not files:
         raise UserError(f"there are no videos in {path}: no {METADATA} of a Minari dataset, and no {', '.join(SUFFIXES)}")
     return [_read(file, image_size) for file in files]
@@ -44,10 +47,23 @@ def episode_videos(
     :return: Frames of each episode, uint8, shape ``(n, image_size, image_size, 3)``
     :raises UserError: If there is no image in the observations, or more than one
     """
+    image = image_of(observation_space)
+    return [resize(image(episode.observations), image_size) for episode in episodes]
+
+
+def image_of(observation_space: spaces.Space) -> Callable[[Any], np.ndarray]:
+    """
+    :param observation_space: Space of observations
+    :return: See :func:`find_image`
+    :raises UserError: If there is no image in them, or more than one
+    """
     image = find_image(observation_space)
     if image is None:
-        raise UserError(f"there is no single image in {observation_space}; record with images: --env-kwargs obs_type:pixels")
-    return [resize(image(episode.observations), image_size) for episode in episodes]
+        raise UserError(
+            f"there is no single image in {observation_space}; our tasks have one with --env-kwargs obs_type:pixels, and a "
+            "folder of video files serves any environment"
+        )
+    return image
 
 
 def _read(file: Path, image_size: int) -> np.ndarray:
@@ -57,8 +73,6 @@ def _read(file: Path, image_size: int) -> np.ndarray:
                 if len(arrays.files) != 1:
                     raise ValueError(f"an .npz holds one array, of frames; this one has {', '.join(arrays.files)}")
                 frames = arrays[arrays.files[0]]
-            if frames.ndim != 4 or frames.dtype != np.uint8:
-                raise ValueError(f"frames are uint8 of (n, height, width, channels), not {frames.dtype} of {frames.shape}")
             video = resize(frames, image_size)
         else:
             # Frame by frame: a video in its own size may not fit into memory
@@ -66,7 +80,8 @@ def _read(file: Path, image_size: int) -> np.ndarray:
                 frames = reader.iter_data()  # type: ignore[attr-defined]  # missing in its stubs
                 video = np.concatenate([resize(np.atleast_3d(frame)[None], image_size) for frame in frames])
     except Exception as error:  # whatever a damaged file makes its decoder raise
-        raise UserError(f"cannot read the video {file}: {one_line(error)}") from error
+        # ffmpeg says last what matters, after its version and how it was built
+        raise UserError(f"cannot read the video {file}: {one_line(error)[-LONGEST_REASON:]}") from error
     if len(video) < 2:
         raise UserError(f"the video {file} has {len(video)} frame; an order needs at least 2")
     return video

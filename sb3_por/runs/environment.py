@@ -20,8 +20,9 @@ EnvWrapper = Callable[[gym.Env], gym.Env]
 VecEnvWrapper = Callable[[VecEnv], VecEnv]
 #: Attribute of a model that holds the text of a ``TrainingEnvironment``; saved in its ``.zip``
 ATTRIBUTE = "training_environment"
-#: Path of the wrapper that adds a ranker's potential to the rewards
+#: Paths of the wrapper that adds a ranker's potential to the rewards: that which is recorded, and that which is documented
 RANKED_PROGRESS = "sb3_por.ranking.progress.RankedProgress"
+RANKED_PROGRESS_PATHS = (RANKED_PROGRESS, "sb3_por.ranking.RankedProgress")
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ def without_ranker(spec: Any) -> list[Any]:
     :param spec: Wrappers, see :func:`import_wrappers`
     :return: The same without ``RankedProgress``, which changes rewards alone and needs a file: scores are the task's own
     """
-    return [one for one in _as_list(spec) if RANKED_PROGRESS not in ([*one] if isinstance(one, dict) else [one])]
+    return [one for one in _as_list(spec) if not set(RANKED_PROGRESS_PATHS) & set(one if isinstance(one, dict) else [one])]
 
 
 def rankers(spec: Any) -> list[str]:
@@ -189,7 +190,7 @@ def rankers(spec: Any) -> list[str]:
     :param spec: Wrappers, see :func:`import_wrappers`
     :return: The files of the rankers among them
     """
-    arguments = [one.get(RANKED_PROGRESS) for one in _as_list(spec) if isinstance(one, dict)]
+    arguments = [one.get(path) for one in _as_list(spec) if isinstance(one, dict) for path in RANKED_PROGRESS_PATHS]
     return [str(one["ranker"]) for one in arguments if isinstance(one, dict) and "ranker" in one]
 
 

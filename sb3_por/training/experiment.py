@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import get_latest_run_id
@@ -319,6 +320,8 @@ class Experiment(ExperimentManager):
                 raise UserError("the networks hold NaN")
         except KeyboardInterrupt:
             self._interrupted = True
+        except gym.error.Error as error:
+            raise UserError(one_line(error)) from error
         except (OSError, ValueError) as error:
             if has_diverged(model):
                 reason = one_line(error) if isinstance(error, UserError) else "the networks hold NaN"

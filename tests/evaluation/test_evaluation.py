@@ -183,6 +183,7 @@ def test_json_holds_no_nan_and_score_falls_back_to_the_return():
     text = json.dumps(evaluation.as_dict(), allow_nan=False)
     assert json.loads(text)["mean"] == {"normalized_performance": None, "return": -2.0, "success": None, "length": 7.0}
     assert str(evaluation) == "return -2.000 ± 1.000, length 7 (2 episodes)"
+    assert Evaluation([0.9, nan], [-3.0, -5.0], [nan, nan], [7, 7], [None, None]).score == 0.9, "not the returns"
 
 
 def test_algorithm_is_found_from_the_file(pendulum_zip, tmp_path, pendulum_model):

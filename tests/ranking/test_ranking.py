@@ -18,6 +18,7 @@ from sb3_por.evaluation import evaluate
 from sb3_por.evaluation.episodes import evaluation_episodes
 from sb3_por.evaluation.video import write_video
 from sb3_por.ranking import RankedProgress, Ranker, read_videos, train_ranker
+from sb3_por.runs.environment import rankers, with_ranker, without_ranker
 from sb3_por.training.zoo import main as train
 
 SIZE = 36
@@ -195,6 +196,20 @@ def test_pictures_are_rendered_where_none_is_observed(file):
         RankedProgress(Walk(obs_type="state"), file)
 
 
+def test_the_picture_of_a_failed_simulation_is_not_ranked(file):
+    class Fails(Walk):
+        def step(self, action):
+            observation, reward, _, _, info = super().step(action)
+            return np.zeros_like(observation), reward, False, True, info | {"sim_error": "tore"}
+
+    env = RankedProgress(Fails(), file)
+    before = env.reset(seed=0)[1]["potential"]
+    _, reward, _, _, info = env.step(np.array([1.0], np.float32))
+    assert reward == 0.5 and info["potential"] == before
+    played = play_at_random(Fails(), evaluation_episodes("FallingBall-v0", 2), image_size=SIZE)
+    assert [len(video) for video in played.videos] == [1, 1]
+
+
 @pytest.mark.parametrize("arguments", [dict(scale=0.0), dict(scale=float("nan")), dict(gamma=0.0), dict(gamma=1.1)])
 def test_wrong_arguments_are_refused(arguments, file):
     with pytest.raises(TypeError, match=f"{next(iter(arguments))} must be float"):
@@ -229,6 +244,39 @@ def test_videos_that_cannot_be_read_are_named(content, message, tmp_path):
         (tmp_path / name).write_bytes(value) if isinstance(value, bytes) else np.savez(tmp_path / name, frames=value)
     with pytest.raises(UserError, match=message):
         read_videos(tmp_path)
+
+
+def test_the_reason_is_the_end_of_what_ffmpeg_says(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    with pytest.raises(UserError, match=r"Invalid data|moov atom") as error:
+        read_videos(tmp_path)
+    assert len(str(error.value)) < 300 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (lambda video: video / 255.0, r"frames are uint8 of .* not float64"),
+        (lambda video: video[..., 0], "frames are uint8 of"),
+        (lambda video: video[:, :0], "frames are uint8 of"),
+        (lambda video: video.transpose(0, 3, 1, 2), "the channels of frames come last"),
+    ],
+)
+def test_what_are_no_frames_is_refused_everywhere(wrong, message, ranker, tmp_path):
+    frames = wrong(videos(1)[0])
+    np.savez(tmp_path / "a.npz", frames=frames)
+    for use in (ranker.potential, lambda frames: train_ranker([frames]), lambda _: read_videos(tmp_path)):
+        with pytest.raises(UserError, match=message):
+            use(frames)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("still", [False, True])
+def test_videos_that_end_as_they_begin_teach_nothing(seed, still):
+    one = videos(1)[0]
+    loop = one[:1].repeat(9, axis=0) if still else np.concatenate([one, one[::-1]])
+    with pytest.raises(UserError, match=r"does not rise along the videos.* cut them where the task is done"):
+        train_ranker([loop] * 3, **{**QUICK, "updates": 5}, seed=seed)
 
 
 def test_an_npz_holds_frames_alone(tmp_path):
@@ -316,6 +364,20 @@ def test_a_model_trained_in_python_is_scored_by_the_task(walk_id, file):
     ours = VisualSAC("CnnPolicy", env, buffer_size=30, learning_starts=15, batch_size=4, policy_kwargs=small).learn(20)
     assert ours.environment_made_of["env_wrapper"][0]["sb3_por.ranking.progress.RankedProgress"]["ranker"] == file
     assert evaluate(ours, walk_id, n_episodes=1).returns == [pytest.approx(0.5 * 20)]
+
+
+def test_the_wrapper_is_known_by_its_short_path_too():
+    spec = [{"sb3_por.ranking.RankedProgress": {"ranker": "a.npz"}}, {"gymnasium.wrappers.ClipReward": {"max_reward": 1}}]
+    assert rankers(spec) == ["a.npz"] and without_ranker(spec) == spec[1:]
+    assert len(with_ranker(spec, "b.npz", {})) == 2
+    assert without_ranker("sb3_por.ranking.RankedProgress") == []
+
+
+def test_a_model_that_observes_no_images_is_refused_before_it_plays(capsys):
+    flags = ["--model", "expert", "--env", "PourWater-v0", "-n", "2", "-o", "r.npz", "--env-kwargs", "obs_type:state"]
+    assert main(["rank", *flags]) == 2
+    told = capsys.readouterr()
+    assert "there is no single image in" in told.err and "videos:" not in told.out
 
 
 @pytest.mark.parametrize(

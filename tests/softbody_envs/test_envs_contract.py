@@ -20,6 +20,7 @@ from trajectories import actions, digest, make, record
 
 from softbody_envs import ENV_IDS
 from softbody_envs.experts import make_expert
+from softbody_envs.tasks.falling_ball import FallingBallEnv
 
 INFO_TYPES = {
     "performance": float,
@@ -409,3 +410,16 @@ def test_memory_does_not_grow_with_many_resets(env_id):
     growth = _growth(env_id, warmup=10, n=500)
     print(env_id, f"{growth:.1f} MB")
     assert growth < 20
+
+
+def test_a_scene_that_starts_solved_is_refused():
+    class Solved(FallingBallEnv):
+        best_performance = 0.0
+
+        def performance(self):
+            return 0.0
+
+    with pytest.raises(
+        ValueError, match=r"variation 7 starts solved.* performance\(\) is 0 at reset, and best_performance is 0"
+    ):
+        Solved().reset(options={"variation": 7})

@@ -207,3 +207,30 @@ def test_a_success_is_rewarded_while_it_lasts_in_every_task(env_id):
 def test_a_threshold_that_the_reset_passes_is_refused(threshold):
     with pytest.raises(ValueError, match="threshold must be above 0"):
         SuccessReward(gym.make(ID, obs_type="state"), threshold=threshold)
+
+
+@pytest.mark.parametrize(
+    "wrap, key",
+    [
+        (ProgressReward, "normalized_performance"),
+        (SuccessReward, "is_success"),
+        (lambda env: SuccessReward(env, threshold=0.5), "normalized_performance"),
+        (ShowQuantity, "monotone"),
+        (lambda env: Distraction(env, motion="drift"), "variation"),
+    ],
+)
+def test_what_an_environment_does_not_report_is_named(wrap, key):
+    class Silent(gym.Env):
+        observation_space = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+        action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros((36, 36, 3), np.uint8), {}
+
+        def step(self, action):
+            return np.zeros((36, 36, 3), np.uint8), 0.0, False, False, {}
+
+    env = wrap(Silent())
+    with pytest.raises(gym.error.Error, match=f"needs info\\['{key}'\\], which .*Silent.* does not report"):
+        env.reset()
+        env.step(np.zeros(1, np.float32))

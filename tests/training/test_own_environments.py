@@ -16,8 +16,8 @@ from sb3_por.common.errors import UserNote
 from sb3_por.evaluation import evaluate, load_safe
 from sb3_por.evaluation.episodes import evaluation_episodes, training_episodes
 from sb3_por.evaluation.loading import resolve
-from sb3_por.runs.folder import is_finished
 from sb3_por.runs.facts import take_inventory
+from sb3_por.runs.folder import is_finished
 from sb3_por.sharing.export import export_run
 from sb3_por.training.zoo import main
 from softbody_envs.wrappers import ActionRepeat
@@ -146,3 +146,10 @@ def test_training_episodes_are_none_of_evaluation(env_id):
         for episodes in (training_episodes(env_id, 50, 0), training_episodes(env_id, 50, 1), evaluation_episodes(env_id, 200))
     ]
     assert not (starts[0] | starts[1]) & starts[2]
+
+
+def test_a_wrapper_that_misses_something_in_info_says_so_in_one_line(line, tmp_path, capsys):
+    wrapper = "env_wrapper:[{'softbody_envs.wrappers.SuccessReward':{}}]"
+    assert main([*line, "-n", "20", "-f", str(tmp_path), "-params", *SMALL, wrapper]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("train.py: error: SuccessReward needs info['is_success'], which")

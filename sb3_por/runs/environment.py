@@ -182,7 +182,7 @@ def without_ranker(spec: Any) -> list[Any]:
     :param spec: Wrappers, see :func:`import_wrappers`
     :return: The same without ``RankedProgress``, which changes rewards alone and needs a file: scores are the task's own
     """
-    return [one for one in _as_list(spec) if not set(RANKED_PROGRESS_PATHS) & set(one if isinstance(one, dict) else [one])]
+    return [one for one in _as_list(spec) if not any(path in _paths(one) for path in RANKED_PROGRESS_PATHS)]
 
 
 def rankers(spec: Any) -> list[str]:
@@ -192,6 +192,10 @@ def rankers(spec: Any) -> list[str]:
     """
     arguments = [one.get(path) for one in _as_list(spec) if isinstance(one, dict) for path in RANKED_PROGRESS_PATHS]
     return [str(one["ranker"]) for one in arguments if isinstance(one, dict) and "ranker" in one]
+
+
+def _paths(wrapper: Any) -> list[Any]:
+    return [*wrapper] if isinstance(wrapper, dict) else [wrapper]
 
 
 def _as_list(spec: Any) -> list[Any]:

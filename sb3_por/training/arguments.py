@@ -244,10 +244,11 @@ def _check_kept(algo: str, changes: dict[str, Any] | None, own: dict[str, Any]) 
     given, made = changes.get("policy_kwargs"), own.get("policy_kwargs") or {}
     if isinstance(given, dict) and any(made.get(name) != value for name, value in given.items()):
         raise UserError("a loaded model keeps its networks; leave out policy_kwargs")
-    if "ent_coef" in changes and algo in ALGOS:
-        default = inspect.signature(ALGOS[algo]).parameters["ent_coef"].default if "ent_coef" not in own else own["ent_coef"]
-        if isinstance(changes["ent_coef"], str) != isinstance(default, str):
-            kind = "learned" if isinstance(default, str) else "fixed"
+    parameters = inspect.signature({**ALGOS, **ALGORITHMS}[algo]).parameters
+    if "ent_coef" in changes and "ent_coef" in parameters:
+        kept = own.get("ent_coef", parameters["ent_coef"].default)
+        if isinstance(changes["ent_coef"], str) != isinstance(kept, str):
+            kind = "learned" if isinstance(kept, str) else "fixed"
             raise UserError(f"the temperature of a loaded model stays {kind}; leave out ent_coef, or give one that is {kind}")
 
 

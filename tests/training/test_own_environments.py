@@ -12,13 +12,14 @@ from stable_baselines3 import SAC
 
 from sb3_por import SACDrQ
 from sb3_por.__main__ import main as evaluation_main
-from sb3_por.common.errors import UserNote
+from sb3_por.common.errors import UserError, UserNote
 from sb3_por.evaluation import evaluate, load_safe
 from sb3_por.evaluation.episodes import evaluation_episodes, training_episodes
 from sb3_por.evaluation.loading import resolve
 from sb3_por.runs.facts import take_inventory
 from sb3_por.runs.folder import is_finished
 from sb3_por.sharing.export import export_run
+from sb3_por.training.arguments import _check_kept
 from sb3_por.training.zoo import main
 from softbody_envs.wrappers import ActionRepeat
 
@@ -111,6 +112,10 @@ def test_a_loaded_agent_keeps_its_networks(line, run, capsys):
 def test_a_resumed_run_keeps_its_kind_of_temperature_and_its_number_of_environments(run, capsys):
     assert main(["--resume", str(run), "-n", "60", "-params", "ent_coef:0.2"]) == 2
     assert "the temperature of a loaded model stays learned; leave out ent_coef" in capsys.readouterr().err
+    _check_kept("ppo", {"ent_coef": 0.1}, {})
+    _check_kept("td3", {"ent_coef": 0.1}, {})  # has none, which another check says
+    with pytest.raises(UserError, match="stays fixed"):
+        _check_kept("sac_por", {"ent_coef": "auto"}, {"ent_coef": 0.2})
     assert main(["--resume", str(run), "-n", "60", "--save-replay-buffer", "-params", SMALL[-1]]) == 0
     settings = (run / "ours-Line-v0" / "config.yml").read_text()
     assert main(["--resume", str(run), "-n", "80", "-params", "n_envs:2"]) == 2

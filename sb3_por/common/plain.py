@@ -1,6 +1,7 @@
 """Plain descriptions of models and spaces: JSON values from which they are made anew, without pickled code."""
 
 import inspect
+import json
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ MAX_VALUES = 2**24
 _SCALARS = (bool, int, float, str, type(None))
 #: Key of a dict that stands for a class; its value is the dotted path
 CLASS = "class"
+#: Key of a dict that stands for a tuple; its value is a list
+TUPLE = "tuple"
 #: Key of a dict that stands for an object that has no plain form; its value is the object's type
 UNKNOWN = "unknown"
 
@@ -68,6 +71,45 @@ def plain(value: Any) -> Any:
     if isinstance(value, type):
         return {CLASS: class_path(value)}
     return {UNKNOWN: class_path(type(value))}
+
+
+def with_marked_tuples(value: Any) -> Any:
+    """
+    :param value: Arguments
+    :return: The same with ``{"tuple": [...]}`` in the place of each tuple, of which JSON would make a list
+    """
+    if isinstance(value, tuple):
+        return {TUPLE: [with_marked_tuples(part) for part in value]}
+    if isinstance(value, list):
+        return [with_marked_tuples(part) for part in value]
+    if isinstance(value, dict):
+        return {key: with_marked_tuples(part) for key, part in value.items()}
+    return value
+
+
+def with_tuples(value: Any) -> Any:
+    """
+    :param value: What ``with_marked_tuples`` returned, perhaps read from JSON
+    :return: The arguments
+    """
+    if isinstance(value, list):
+        return [with_tuples(part) for part in value]
+    if isinstance(value, dict):
+        if value.keys() == {TUPLE} and isinstance(value[TUPLE], list):
+            return tuple(with_tuples(value[TUPLE]))
+        return {key: with_tuples(part) for key, part in value.items()}
+    return value
+
+
+def is_kept(value: Any) -> bool:
+    """
+    :param value: Arguments
+    :return: Whether JSON keeps them, once tuples are marked
+    """
+    try:
+        return bool(with_tuples(json.loads(json.dumps(with_marked_tuples(value)))) == value)
+    except (TypeError, ValueError, RecursionError):
+        return False
 
 
 def class_path(cls: type) -> str:

@@ -11,6 +11,7 @@ import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_por.common.errors import UserError, one_line, short
+from sb3_por.common.plain import with_tuples
 from sb3_por.runs.folder import dump_settings, import_names, parse_settings
 from sb3_por.visual.made_of import made_of
 
@@ -73,7 +74,7 @@ class TrainingEnvironment:
             return None
         stored = cls.of_data(vars(model))
         described = made_of(vars(model).get("env")) if stored is None else None
-        return stored if described is None else cls(**described)
+        return stored if described is None else cls(**with_tuples(described))
 
     @classmethod
     def of_data(cls, data: dict[str, Any]) -> "TrainingEnvironment | None":
@@ -85,8 +86,8 @@ class TrainingEnvironment:
         try:
             if isinstance(text, str):
                 return cls(**parse_settings(text))
-            return cls(**described) if isinstance(described, dict) else None
-        except (TypeError, ValueError):
+            return cls(**with_tuples(described)) if isinstance(described, dict) else None
+        except (TypeError, ValueError, RecursionError):
             return None
 
     @property

@@ -1,12 +1,13 @@
 """What a model's environments are made of, as far as they tell, to evaluate the model in the same."""
 
-import json
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+
+from sb3_por.common.plain import is_kept, with_marked_tuples
 
 #: Wrappers that change neither what a policy sees nor how its actions act, and subclasses; whole episodes are scored
 PASSED_OVER = (
@@ -26,7 +27,7 @@ def made_of(env: VecEnv | None) -> dict[str, Any] | None:
     Describe environments that ``gymnasium.make`` has made, and the wrappers around them.
 
     :param env: Vectorized environments of this process; worker processes keep theirs
-    :return: For JSON: ``env_id``, ``env_kwargs``, ``env_wrapper`` (``[{path: arguments}]``, the innermost first),
+    :return: For JSON, tuples marked: ``env_id``, ``env_kwargs``, ``env_wrapper`` (``[{path: arguments}]``, innermost first),
         ``normalize`` (arguments of ``VecNormalize``) and ``unknown`` (names of what cannot be made again from its name and
         plain arguments); None where nothing is known
     """
@@ -51,11 +52,11 @@ def made_of(env: VecEnv | None) -> dict[str, Any] | None:
         kwargs["render_mode"] = "rgb_array"  # a wrapper may show it to the policy
     return {
         "env_id": inner.spec.id,
-        "env_kwargs": {name: value for name, value in kwargs.items() if _is_plain(value)},
-        "env_wrapper": [{_path(type(one)): _arguments(one)} for one in known],
+        "env_kwargs": {name: with_marked_tuples(value) for name, value in kwargs.items() if is_kept(value)},
+        "env_wrapper": [{_path(type(one)): with_marked_tuples(_arguments(one))} for one in known],
         "normalize": normalize,
         "unknown": [type(wrapper).__name__ for wrapper in wrappers if wrapper not in known]
-        + [name for name, value in kwargs.items() if not _is_plain(value)],
+        + [name for name, value in kwargs.items() if not is_kept(value)],
     }
 
 
@@ -73,7 +74,7 @@ def _has_limit(env: gym.Env) -> bool:
 
 def _can_be_made(wrapper: gym.Wrapper) -> bool:
     return (
-        isinstance(wrapper, RecordConstructorArgs) and "<" not in type(wrapper).__qualname__ and _is_plain(_arguments(wrapper))
+        isinstance(wrapper, RecordConstructorArgs) and "<" not in type(wrapper).__qualname__ and is_kept(_arguments(wrapper))
     )
 
 
@@ -87,11 +88,3 @@ def _path(cls: type) -> str:
 
 def _arguments(wrapper: Any) -> dict[str, Any]:
     return {name: value for name, value in wrapper._saved_kwargs.items() if name != "env"}
-
-
-def _is_plain(value: Any) -> bool:
-    """Whether JSON keeps a value as it is."""
-    try:
-        return bool(json.loads(json.dumps(value)) == value)
-    except (TypeError, ValueError):
-        return False

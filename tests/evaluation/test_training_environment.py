@@ -224,6 +224,17 @@ def test_a_model_trained_from_python_is_evaluated_inside_its_wrappers(cls, tmp_p
         assert scores(tmp_path / "again.zip") == scores(model)
 
 
+def test_arguments_that_are_tuples_stay_tuples(tmp_path):
+    """``ResizeObservation`` refuses a list."""
+    env = gym.wrappers.ResizeObservation(gym.make("FallingBall-v0", obs_type="pixels", image_size=48), (40, 44))
+    model = SACPOR("CnnPolicy", env, buffer_size=100, learning_starts=1000).learn(5)
+    model.save(tmp_path / "model.zip")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*made without", UserNote)
+        returns = [evaluate(given, "FallingBall-v0", n_episodes=2).returns for given in (model, tmp_path / "model.zip")]
+    assert returns[0] == returns[1]
+
+
 @pytest.mark.parametrize(
     ("wrap", "name"),
     [

@@ -52,7 +52,8 @@ class Diagnosis:
     :param leak_accuracy: accuracy on them
     :param random_loss: POR loss on frames of a random policy
     :param random_accuracy: accuracy on them
-    :param grad_norm_critic: norm of the critic loss's gradient with respect to the encoder
+    :param grad_norm_critic: norm of the critic loss's gradient with respect to the encoder, for the task's own rewards even
+        where ``VecNormalize`` scales them in training
     :param grad_norm_por: norm of the weighted POR loss's gradient with respect to the encoder
     :param feature_std: standard deviation of the encoder's features over the policy's own frames, mean over features; near 0
         the encoder has collapsed to a constant

@@ -108,11 +108,11 @@ class Grid:
         for env in set(self.envs) - set(envs):
             missing = [algo for algo in self.algos if not self.of(algo, env)]
             self.note(f"{env} was not run with {' and '.join(missing)}, so comparisons of all algorithms leave it out")
-        compared = [curve for curve in self.curves if curve.env in envs]
-        step = self._span(compared, "the comparison")[1]
+        compared = {algo: self._same_number(algo, envs) for algo in self.algos}
+        kept = [curve for by_env in compared.values() for curves in by_env for curve in curves]
+        step = self._span(kept, "the comparison")[1]
         matrices = {}
-        for algo in self.algos:
-            by_env = self._same_number(algo, envs)
+        for algo, by_env in compared.items():
             ends = [[np.interp(step, curve.steps, curve.scores) for curve in curves] for curves in by_env]
             matrices[algo] = np.array(ends).T
         return step, matrices

@@ -16,6 +16,18 @@ from sb3_por.visual.replay_buffer import SequenceReplayBuffer
 CHUNK = 256
 
 
+class AsPlayed(SequenceReplayBuffer):
+    """Transitions as a model's environments gave them, normalized there if anywhere: a model's own normalizer has no part."""
+
+    @staticmethod
+    def _normalize_obs(obs: Any, env: Any = None) -> Any:
+        return obs
+
+    @staticmethod
+    def _normalize_reward(reward: np.ndarray, env: Any = None) -> np.ndarray:
+        return reward
+
+
 @dataclass(frozen=True)
 class Played:
     """
@@ -61,7 +73,7 @@ def play(model: Any, env: VecEnv, episodes: list[Episode], at_random: bool = Fal
             quantities.append(_quantity(env.unwrapped.reset_infos[0]))
             steps.append(0)
         observation = following
-    buffer = SequenceReplayBuffer(
+    buffer = AsPlayed(
         len(transitions), model.observation_space, model.action_space, model.device, n_steps=model.n_steps, gamma=model.gamma
     )
     for transition in transitions:

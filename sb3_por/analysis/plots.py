@@ -224,8 +224,9 @@ def _single(table: pd.DataFrame) -> bool:
 
 
 def _interval_of(table: pd.DataFrame) -> str:
-    # The bootstrap resamples runs within each task, so one run per task has no interval.
-    return "one seed, no interval" if _single(table) else "95 % stratified bootstrap interval"
+    # The bootstrap resamples runs within each task, so one run per task has no interval, unless its rival has several.
+    has_none = _single(table) and bool((table["low"] == table["high"]).all())
+    return "one seed, no interval" if has_none else "95 % stratified bootstrap interval"
 
 
 def _spread(table: pd.DataFrame) -> str:

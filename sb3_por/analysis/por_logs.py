@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_por.analysis.scores import RUN_KEYS, join_runs
-from sb3_por.common.errors import UserError, one_line
+from sb3_por.analysis.scores import RUN_KEYS, is_table, join_runs, read_table
+from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write
 from sb3_por.runs.facts import run_identity
 from sb3_por.runs.folder import ARGUMENTS, TENSORBOARD, find_runs, read_evaluations, run_arguments
@@ -44,8 +44,8 @@ def read_order(paths: Iterable[str | Path]) -> tuple[pd.DataFrame, list[str]]:
         same seed
     """
     given = [Path(path) for path in paths]
-    tables, notes = [_read_csv(path) for path in given if path.suffix == ".csv"], []
-    for run in find_runs(path for path in given if path.suffix != ".csv"):
+    tables, notes = [_read_csv(path) for path in given if is_table(path)], []
+    for run in find_runs(path for path in given if not is_table(path)):
         try:
             tables.append(read_order_of(run))
         except NoLogs as error:
@@ -151,11 +151,7 @@ def _latest(events: list[tuple[int, float]]) -> pd.Series:
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
-    try:
-        order = pd.read_csv(path, dtype={"env": str, "algo": str}, float_precision="round_trip")
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path}: {one_line(error)}") from error
-    missing = [column for column in [*RUN_KEYS, "step", "por_loss"] if column not in order]
-    if missing:
-        raise UserError(f"{path} has no column {', '.join(missing)}; an order table has {','.join(ORDER_COLUMNS)}")
-    return order.reindex(columns=ORDER_COLUMNS)
+    order = read_table(path, ORDER_COLUMNS, [*RUN_KEYS, "step", "por_loss"], "an order table")
+    if order["por_loss"].isna().all():
+        raise UserError(f"{path}: the column por_loss is empty")
+    return order

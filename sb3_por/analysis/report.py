@@ -18,7 +18,7 @@ from sb3_por.analysis.learning_curves import sort_algos
 from sb3_por.analysis.plots import LABELS
 from sb3_por.analysis.por_logs import read_order
 from sb3_por.analysis.saliency import draw_saliency
-from sb3_por.analysis.scores import METRICS, RUN_KEYS, join_runs, read_csv, read_run, unlike_runs
+from sb3_por.analysis.scores import METRICS, RUN_KEYS, is_table, join_runs, read_csv, read_run, unlike_runs
 from sb3_por.common.errors import UserError
 from sb3_por.common.files import atomic_write, check_writable
 from sb3_por.evaluation.loading import LOADABLE, resolve
@@ -94,12 +94,12 @@ def write_report(
     folder = Path(folder)
     check_writable(folder)
     given = [Path(path) for path in paths]
-    folders = [path for path in given if path.suffix != ".csv"]
+    folders = [path for path in given if not is_table(path)]
     for path in folders:
         if not path.is_dir():
             raise UserError(f"there is no folder {path}")
     runs, orphans = take_inventory(folders), orphaned_logs(folders)
-    scores = _scores([path for path in given if path.suffix == ".csv"], runs)
+    scores = _scores([path for path in given if is_table(path)], runs)
     if scores is None and not runs and not orphans:
         raise UserError(f"no run under {' '.join(map(str, folders))}")
 
@@ -117,13 +117,13 @@ def write_report(
         notes += unlike_runs(run.folder for run in _evaluated(runs)) + without_logs + left_out
         save_all(plots, folder / FIGURES)
         if videos:
-            shown = _show_models(_best_runs(runs, scores, metric), notes)
+            shown = _show_models(_best_runs(runs, metric), notes)
     page = _template().render(
-        title=", ".join((path.parent if path.suffix == ".csv" else path).resolve().name for path in given),
+        title=", ".join((path.parent if is_table(path) else path).resolve().name for path in given),
         metric=LABELS.get(metric or "", ""),
         n_runs=len({(run.env, run.algo, run.seed) for run in runs} | _identities(scores)),
         n_scores=0 if scores is None else len(scores),
-        runs=[_run_row(run, scores, metric) for run in runs],
+        runs=[_run_row(run, metric) for run in runs],
         commits=sorted({run.commit for run in runs} | (set() if scores is None else set(scores["commit"])) - {""}),
         machines=sorted({run.machine for run in runs} - {""}),
         settings=_settings(runs),
@@ -176,7 +176,7 @@ def _section(plot: Plot, figures: Path) -> Section:
     return Section(plot.title, plot.name, _picture(plot.title, figures / f"{plot.name}.png"), header, rows)
 
 
-def _run_row(run: RunFacts, scores: pd.DataFrame | None, metric: str | None) -> dict[str, str]:
+def _run_row(run: RunFacts, metric: str | None) -> dict[str, str]:
     """One row of the table of runs."""
     row = {
         "algorithm": run.algo,
@@ -190,8 +190,8 @@ def _run_row(run: RunFacts, scores: pd.DataFrame | None, metric: str | None) -> 
         "commit": run.commit or "not recorded",
         "machine": run.machine or "not recorded",
     }
-    if scores is not None and metric is not None:
-        rows = _rows_of(run, scores)
+    if metric is not None and _evaluated([run]):
+        rows = read_run(run.folder)
         values = rows[metric].dropna()
         if len(values):
             row |= {"last score": _printed(values.iloc[-1]), "best score": _printed(values.max())}
@@ -214,13 +214,13 @@ def _settings(runs: list[RunFacts]) -> list[dict[str, Any]]:
     ]
 
 
-def _best_runs(runs: list[RunFacts], scores: pd.DataFrame, metric: str) -> Iterator[tuple[str, str, RunFacts, float]]:
+def _best_runs(runs: list[RunFacts], metric: str) -> Iterator[tuple[str, str, RunFacts, float]]:
     """The run with the best evaluation for each task and algorithm, among runs with a saved model."""
-    with_model = [run for run in runs if (run.folder / BEST_MODEL).is_file()]
+    with_model = [run for run in _evaluated(runs) if (run.folder / BEST_MODEL).is_file()]
     for env in sorted({run.env for run in with_model}):
         for algo in sort_algos(run.algo for run in with_model if run.env == env):
             members = [run for run in with_model if (run.env, run.algo) == (env, algo)]
-            best = [_rows_of(run, scores)[metric].max() for run in members]
+            best = [read_run(run.folder)[metric].max() for run in members]
             if np.isfinite(best).any():
                 yield env, algo, members[int(np.nanargmax(best))], float(np.nanmax(best))
 
@@ -259,10 +259,6 @@ def _learns_order(model: Any) -> bool:
     except UserError:
         return False
     return True
-
-
-def _rows_of(run: RunFacts, scores: pd.DataFrame) -> pd.DataFrame:
-    return scores[(scores["env"] == run.env) & (scores["algo"] == run.algo) & (scores["seed"] == run.seed)]
 
 
 def _picture(title: str, path: Path) -> Picture:

@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 from captum.attr import NoiseTunnel, Saliency
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
 
 from sb3_por.analysis.diagnostics import check_order
 from sb3_por.common.errors import UserError
@@ -55,12 +56,12 @@ def overlay(frame: np.ndarray, heat: np.ndarray, size: int = SIZE) -> np.ndarray
     """
     Draw a saliency map over its frame.
 
-    :param frame: RGB, uint8 ``(height, width, 3)``
+    :param frame: uint8, RGB ``(height, width, 3)`` or grey ``(height, width, 1)``
     :param heat: saliency map, ``(height, width)`` in [0, 1]
     :param size: height and width of each picture
     :return: the frame, and beside it the frame in grey under the map; uint8 ``(size, 2 * size, 3)``
     """
-    frame = cv2.resize(frame, (size, size), interpolation=cv2.INTER_NEAREST)
+    frame = cv2.resize(np.repeat(frame, 3 // frame.shape[2], axis=2), (size, size), interpolation=cv2.INTER_NEAREST)
     heat = cv2.resize(heat.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC).clip(0, 1)
     colors = cv2.cvtColor(cv2.applyColorMap((255 * heat).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     grey = cv2.cvtColor(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
@@ -99,6 +100,11 @@ def draw_saliency(
     if not isinstance(model.observation_space, spaces.Box) or len(model.observation_space.shape) != 3:
         raise UserError(f"a saliency map needs a model that observes images alone, not {model.observation_space}")
     env = make_evaluation_env(model, env_id, **environment)
+    stack = unwrap_vec_wrapper(env, VecFrameStack)
+    n_channels = model.observation_space.shape[0] // (1 if stack is None else stack.stacked_obs.n_stack)
+    if n_channels not in (1, 3):
+        env.close()
+        raise UserError(f"a saliency map needs images in colour or grey, not of {n_channels} channels")
     try:
         env.env_method("play", evaluation_episodes(env_id, 1, seed))
         observation: Any = env.reset()
@@ -115,9 +121,8 @@ def draw_saliency(
         step = k + int(np.argmax(np.array(monotone[k:]) - np.array(monotone[:-k])))
     if not k <= step < len(frames):
         raise UserError(f"--step must be from {k} to {len(frames) - 1}, got {step}")
-    picture = overlay(
-        np.ascontiguousarray(frames[step][-3:].transpose(1, 2, 0)), saliency_map(model, frames[step - k], frames[step])
-    )
+    frame = np.ascontiguousarray(frames[step][-n_channels:].transpose(1, 2, 0))
+    picture = overlay(frame, saliency_map(model, frames[step - k], frames[step]))
     with atomic_write(path) as temporary:
         # OpenCV's own writing does not tell of a full disk.
         temporary.write_bytes(cv2.imencode(path.suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())

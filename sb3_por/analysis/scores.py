@@ -37,8 +37,8 @@ def read_scores(paths: Iterable[str | Path]) -> pd.DataFrame:
     :raises UserError: if a path holds no scores, or two runs of one algorithm and environment have one seed
     """
     given = [Path(path) for path in paths]
-    tables = [read_csv(path) for path in given if path.suffix == ".csv"]
-    folders = [path for path in given if path.suffix != ".csv"]
+    tables = [read_csv(path) for path in given if is_table(path)]
+    folders = [path for path in given if not is_table(path)]
     runs = find_runs(folders)
     for note in unlike_runs(runs):
         warnings.warn(note, UserNote)
@@ -140,6 +140,11 @@ def read_run(run: Path) -> pd.DataFrame:
     return scores
 
 
+def is_table(path: Path) -> bool:
+    """Whether a path names a table, and no folder of runs."""
+    return path.suffix.lower() == ".csv"
+
+
 def read_csv(path: Path) -> pd.DataFrame:
     """
     Read a table of scores.
@@ -148,18 +153,9 @@ def read_csv(path: Path) -> pd.DataFrame:
     :return: the table
     :raises UserError: if it cannot be read or lacks a column
     """
-    try:
-        # Pandas' faster way changes last digits, and with them the lines of a table that is written again
-        text = {"env": str, "algo": str, "commit": str}
-        scores = pd.read_csv(path, dtype=text, float_precision="round_trip")
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path}: {one_line(error)}") from error
-    missing = [column for column in [*RUN_KEYS, "step"] if column not in scores]
-    if missing:
-        raise UserError(f"{path} has no column {', '.join(missing)}; a table of scores has {','.join(COLUMNS)}")
+    scores = read_table(path, COLUMNS, [*RUN_KEYS, "step"], "a table of scores")
     if scores.empty:
         raise UserError(f"{path} holds no scores")
-    scores = scores.reindex(columns=COLUMNS)
     scores["commit"] = scores["commit"].fillna("")
     for column in ("seed", "step"):
         if not pd.api.types.is_integer_dtype(scores[column]):
@@ -168,6 +164,32 @@ def read_csv(path: Path) -> pd.DataFrame:
         scores[column] = pd.to_numeric(scores[column], errors="coerce")
     scores.attrs["source"] = str(path)
     return scores
+
+
+def read_table(path: Path, columns: list[str], needed: list[str], what: str) -> pd.DataFrame:
+    """
+    Read a table of runs, whatever their labels: ``None`` and ``NA`` are names here.
+
+    :param path: A ``.csv`` file
+    :param columns: Its columns; those that it lacks are NaN
+    :param needed: Columns that it must have
+    :param what: Name of such a table, for messages
+    :return: The table
+    :raises UserError: If it cannot be read, lacks a column, or has a row without an environment or algorithm
+    """
+    try:
+        # Pandas' faster way changes last digits, and with them the lines of a table that is written again
+        names = dict.fromkeys(("env", "algo", "commit"), str)
+        table = pd.read_csv(path, converters=names, float_precision="round_trip")
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {path}: {one_line(error)}") from error
+    missing = [column for column in needed if column not in table]
+    if missing:
+        raise UserError(f"{path} has no column {', '.join(missing)}; {what} has {','.join(columns)}")
+    for column in ("env", "algo"):
+        if (table[column] == "").any():
+            raise UserError(f"{path}: a row has no {column}")
+    return table.reindex(columns=columns)
 
 
 def write_csv(scores: pd.DataFrame, path: str | Path) -> None:

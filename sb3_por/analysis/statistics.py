@@ -230,7 +230,7 @@ def _ratios(*scores: np.ndarray) -> np.ndarray:
 def _note_single_seeds(grid: Grid) -> None:
     single = [algo for algo in grid.algos if any(len(grid.of(algo, env)) == 1 for env in grid.envs)]
     if single:
-        grid.note(f"one seed of {' and '.join(single)}: an interval over seeds has no width then, and tells nothing")
+        grid.note(f"one seed of {' and '.join(single)}: how far its seeds differ is not known, and no interval includes it")
 
 
 def _interval(

@@ -4,6 +4,7 @@ import argparse
 import json
 import shutil
 import sys
+from pathlib import Path
 
 from sb3_por.commands.command import Command, load_model_and_environment, model_arguments, seed
 from sb3_por.common.errors import UserError
@@ -27,7 +28,7 @@ def _plot_arguments(parser: argparse.ArgumentParser) -> None:
 def _plot(args: argparse.Namespace) -> None:
     from sb3_por.analysis import figures
     from sb3_por.analysis.por_logs import read_order, write_order
-    from sb3_por.analysis.scores import read_scores, write_csv
+    from sb3_por.analysis.scores import is_table, read_scores, write_csv
     from sb3_por.common.files import check_output, check_writable
 
     if args.kind == "all":
@@ -47,7 +48,7 @@ def _plot(args: argparse.Namespace) -> None:
         scores = read_scores(args.paths)
         how = {"metric": args.metric, "step": args.step, "seed": args.seed}
         if args.kind == "all":
-            order, left_out = read_order(path for path in args.paths if not path.endswith(".csv"))
+            order, left_out = read_order(path for path in args.paths if not is_table(Path(path)))
             plots, notes = figures.plot_all(scores, order, **how)
             notes = [*left_out, *notes]
             figures.save_all(plots, args.output)

@@ -97,7 +97,9 @@ class Demonstrations:
     def _problem(self, episode: RecordedEpisode) -> str | None:
         """What is wrong with an episode."""
         n = len(episode.rewards)
-        parts = episode.observations.values() if isinstance(episode.observations, dict) else [episode.observations]
+        parts = list(episode.observations.values()) if isinstance(episode.observations, dict) else [episode.observations]
+        if not all(isinstance(part, np.ndarray) and part.dtype.kind in "biuf" for part in parts):
+            return "its observations are neither an array of numbers nor named arrays, as algorithms here need"
         if n == 0 or episode.actions.shape != (n, *(self.action_space.shape or ())):
             return f"{n} rewards, and actions of shape {episode.actions.shape} for {self.action_space}"
         if any(len(part) != n + 1 for part in parts):

@@ -124,10 +124,10 @@ def resolve(
         find_environment(env_id, path, safe)
         if safe:
             with failing_in_one_line(path):
-                environment = trained_in(path, env_id, safe=True)
+                environment = trained_in(path, env_id, safe=True, quiet=bool(given))
                 model = _load_safe(path, env_id, environment, algo)
         else:
-            environment = trained_in(path, env_id)
+            environment = trained_in(path, env_id, quiet=bool(given))
             model = load_model(path, algo)
     else:
         quiet, made_of = bool(given) or env_kwargs is not None, TrainingEnvironment.of_model(model)
@@ -155,11 +155,12 @@ def _load_safe(path: Path, env_id: str, environment: dict[str, Any], algo: str |
         env.close()
 
 
-def trained_in(path: str | Path, env_id: str, safe: bool = False) -> dict[str, Any]:
+def trained_in(path: str | Path, env_id: str, safe: bool = False, quiet: bool = False) -> dict[str, Any]:
     """
     :param path: A run folder, or the path of a model
     :param env_id: Gymnasium id
     :param safe: Refuse what could run code of a stranger's choice
+    :param quiet: Say nothing of what the environment lacks, since a caller adds it
     :return: Arguments of :func:`sb3_por.evaluation.environment.make_evaluation_env`, besides model and id: from the run's
         folder, else from the model's ``.zip``; None for what neither tells of this environment
     :raises UserError: If a wrapper cannot be imported, or something is refused
@@ -174,7 +175,7 @@ def trained_in(path: str | Path, env_id: str, safe: bool = False) -> dict[str, A
         made_of: TrainingEnvironment | None = TrainingEnvironment.of_settings(env_id.rpartition(":")[2], settings)
     else:
         made_of = TrainingEnvironment.of_data(plain_files.read_json(file) if safe else read_data(file))
-        if made_of is None:
+        if made_of is None and not quiet:
             warnings.warn(NO_WRAPPERS.format(file, env_id), UserNote)
     of_best = folder / BEST_STATISTICS
     pickled = of_best if file.name == BEST_MODEL and of_best.is_file() else folder / STATISTICS
@@ -187,7 +188,7 @@ def trained_in(path: str | Path, env_id: str, safe: bool = False) -> dict[str, A
         statistics = file if plain_files.has_statistics(file) else None
         if safe and statistics is None and pickled.is_file() and made_of is not None and made_of.normalizes_observations:
             raise UserError(f"{pickled} is a pickle, which safe loading does not read; export the run where it is trusted")
-    return _arguments(made_of, env_id, None if statistics is None else str(statistics))
+    return _arguments(made_of, env_id, None if statistics is None else str(statistics), quiet)
 
 
 def _arguments(

@@ -68,14 +68,17 @@ def record_video(
     rendering: dict[str, Any] = {"render_mode": "rgb_array"} | ({} if task_class(env_id) is None else {"render_size": size})
     wrap = environment["env_wrapper"]
 
+    fps = 30.0
+
     def recorded(env: gym.Env) -> gym.Env:
-        innermost: gym.Env = RenderCollection(env, reset_clean=False)  # records every step inside an ActionRepeat
+        nonlocal fps
+        fps = env.metadata.get("render_fps", fps)  # of every step inside an ActionRepeat, as is recorded
+        innermost: gym.Env = RenderCollection(env, reset_clean=False)
         return innermost if wrap is None else wrap(innermost)
 
     changes = {"env_kwargs": environment["env_kwargs"] | rendering, "env_wrapper": recorded}
     env = make_evaluation_env(loaded, env_id, **environment | changes)
     try:
-        fps = env.get_attr("metadata")[0].get("render_fps", 30)
         evaluation = run_episodes(loaded, env, evaluation_episodes(env_id, n_episodes, seed))
         # The vectorised environment resets itself after the last episode: the last frame belongs to the next one.
         frames = env.env_method("render")[0][:-1]

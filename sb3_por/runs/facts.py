@@ -90,6 +90,9 @@ def _facts(run: Path) -> RunFacts:
     # -1 is the zoo's "as many as the settings say".
     planned = next((n for n in (arguments.get("n_timesteps"), config.get("n_timesteps")) if n and n > 0), None)
     finished = is_finished(run, identity["env"])
+    settings = {**config, **{name: arguments[name] for name in SETTINGS if arguments.get(name) not in (None, -1)}}
+    # The RL Zoo has the arguments of the command line in its other file alone
+    env_kwargs = {**(config.get("env_kwargs") or {}), **(arguments.get("env_kwargs") or {})}
     return RunFacts(
         **identity,
         folder=run,
@@ -98,7 +101,7 @@ def _facts(run: Path) -> RunFacts:
         planned=None if planned is None else int(planned),
         commit=arguments.get("commit", ""),
         machine=arguments.get("machine", ""),
-        settings={**config, **{name: arguments[name] for name in SETTINGS if arguments.get(name) not in (None, -1)}},
+        settings=settings | ({"env_kwargs": env_kwargs} if env_kwargs else {}),
         log=[] if finished else _last_lines(run.parents[1] / LOG),
     )
 
@@ -141,6 +144,6 @@ def run_identity(run: Path) -> dict[str, Any]:
     name, _, number = run.name.rpartition("_")
     return {
         "env": arguments.get("env", name or run.name),
-        "algo": arguments.get("label") or arguments.get("algo", run.parent.name),
+        "algo": str(arguments.get("label") or arguments.get("algo", run.parent.name)),
         "seed": int(arguments.get("seed", number if number.isdigit() else 0)),
     }

@@ -54,12 +54,17 @@ def _memory(run: Run) -> int:
     parameter = inspect.signature(LOADABLE[run.algo]).parameters.get("buffer_size")
     if parameter is None:
         return PROCESS
-    steps = int(run.flags[run.flags.index("-n") + 1]) if "-n" in run.flags else int(settings.get("n_timesteps", 1e9))
-    size = min(int(settings.get("buffer_size", parameter.default)), steps)
+    steps = int(run.flags[run.flags.index("-n") + 1]) if "-n" in run.flags else _number(settings.get("n_timesteps"), 10**9)
+    size = min(_number(settings.get("buffer_size"), parameter.default), steps)
     # SB3's own buffers store the next observation, too.
     copies = 1 if issubclass(LOADABLE[run.algo], VisualActorCritic) else 2
-    frame = _observation_size(run.env, settings.get("env_kwargs") or {}) * (settings.get("frame_stack") or 1)
+    frame = _observation_size(run.env, settings.get("env_kwargs") or {}) * _number(settings.get("frame_stack"), 1)
     return PROCESS + size * copies * frame
+
+
+def _number(value: Any, otherwise: int) -> int:
+    """A setting; where it is none or no number, which its run will tell, the default."""
+    return int(value) if isinstance(value, (int, float)) else otherwise
 
 
 def _observation_size(env_id: str, env_kwargs: dict[str, Any]) -> int:

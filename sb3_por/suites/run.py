@@ -9,7 +9,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_por.runs.folder import LOG, is_finished, run_arguments
+from sb3_por.runs.folder import LOG, env_name, is_finished, run_arguments
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Run:
     @property
     def run_folder(self) -> Path:
         """Folder to which train.py writes."""
-        return self.folder / self.algo / f"{self.env}_1"
+        return self.folder / self.algo / f"{env_name(self.env)}_1"
 
     @property
     def log(self) -> Path:

@@ -18,7 +18,7 @@ from rich.table import Column, Table
 from sb3_por.analysis.scores import read_scores, write_csv
 from sb3_por.common.errors import UserNote
 from sb3_por.common.files import check_writable, disk_errors
-from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, read_settings
+from sb3_por.runs.folder import EVALUATIONS, HYPERPARAMETERS, read_settings, settings_folder
 from sb3_por.runs.lock import lock_folder
 from sb3_por.suites.cluster import outlive
 from sb3_por.suites.inputs import check_inputs
@@ -177,4 +177,4 @@ def _total_steps(run: Run) -> int:
     """Steps of a whole run; 0 as long as only its settings say it and it has not written them."""
     if "-n" in run.flags:
         return int(run.flags[run.flags.index("-n") + 1])
-    return int(read_settings(run.run_folder / run.env / HYPERPARAMETERS).get("n_timesteps") or 0)
+    return int(read_settings(settings_folder(run.run_folder, run.env) / HYPERPARAMETERS).get("n_timesteps") or 0)

@@ -12,6 +12,7 @@ from sb3_por.common.errors import UserError, check_known, one_line
 from sb3_por.common.shipped import shipped
 from sb3_por.evaluation.loading import LOADABLE, import_packages
 from sb3_por.suites.run import Run
+from sb3_por.training.hyperparameters import changed
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,9 @@ def suite_runs(suite: Suite, root: Path) -> list[Run]:
                 algo = variant.pop("algo", name)
                 # From wide to narrow: a variant is its algorithm, overrides and all, but for what makes it one.
                 wide, narrow = (env, algo, f"{algo}/{env}"), (name, f"{name}/{env}") if name in suite.variants else ()
-                changes = dict(suite.hyperparams)
-                for part in (*(suite.overrides.get(key, {}) for key in wide), variant):
-                    changes |= part
-                for key in narrow:
-                    changes |= suite.overrides.get(key, {})
+                overrides = suite.overrides
+                parts = [*(overrides.get(key, {}) for key in wide), variant, *(overrides.get(key, {}) for key in narrow)]
+                changes = changed(suite.hyperparams, *parts)
                 params = ["-params", *(f"{name}:{value!r}" for name, value in changes.items())] if changes else []
                 demos = ["--demos", str(Path(suite.demos) / env)] if suite.demos is not None else []
                 flags = [*common, "--num-threads", str(suite.threads), *packages, *demos, *params]

@@ -76,11 +76,19 @@ RANGES = {
 WITH_DEFAULT = ("n_timesteps", "n_jobs", "num_threads", "seed")
 
 
+#: What words mean that YAML reads as values; as text, ``false`` would be true
+WORDS = {"true": True, "false": False, "null": None, "none": None}
+
+
 class Settings(StoreDict):
-    """``key:value`` pairs whose values are Python, as in the zoo, or else plain words: ``pairing:paper``."""
+    """
+    ``key:value`` pairs whose values are Python, as in the zoo, or else YAML's ``true``, ``false`` and ``null`` or plain words:
+    ``pairing:paper``. A flag that is given again adds to its pairs.
+    """
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        stored: dict[str, Any] = {}
+        before = getattr(namespace, self.dest, None)
+        stored: dict[str, Any] = {} if before is self.default else dict(before or {})
         for pair in values:
             one = argparse.Namespace()
             try:
@@ -93,7 +101,7 @@ class Settings(StoreDict):
                 key, colon, word = pair.partition(":")
                 if not colon or not word:
                     parser.error(f"{option_string} takes key:value pairs, got {pair!r}")
-                stored[key] = word
+                stored[key] = WORDS.get(word.lower(), word)
             except (Exception, SystemExit) as error:
                 parser.error(f"{option_string} {pair}: {type(error).__name__}: {one_line(error)}")
         setattr(namespace, self.dest, stored)

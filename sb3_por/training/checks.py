@@ -62,6 +62,9 @@ def check_zoo_settings(settings: dict[str, Any]) -> None:
         value = settings.get(name, 1)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise UserError(f"{name} must be a whole number of at least 1, got {value!r}")
+    unit = settings["train_freq"][-1:] if isinstance(settings.get("train_freq"), (tuple, list)) else ()
+    if settings.get("n_envs", 1) > 1 and tuple(unit) == ("episode",):
+        raise UserError("train_freq in episodes needs one environment: n_envs:1, or a train_freq in steps")
     if settings.get("noise_type") and "noise_std" not in settings:
         raise UserError("noise_type needs noise_std")
     if "seed" in settings:

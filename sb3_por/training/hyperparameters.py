@@ -56,10 +56,17 @@ def changed(settings: dict[str, Any], *changes: dict[str, Any]) -> dict[str, Any
     :param settings: Settings
     :param changes: Changes to them, the later one wins
     :return: The settings with the changes; ``env_kwargs`` add to those that were there, all others replace them
+    :raises UserError: If ``env_kwargs`` are no names and values
     """
     merged = dict(settings)
     for one in changes:
-        merged |= one | {"env_kwargs": {**(merged.get("env_kwargs") or {}), **(one.get("env_kwargs") or {})}}
+        env_kwargs = [part.get("env_kwargs") or {} for part in (merged, one)]
+        for part in env_kwargs:
+            if not isinstance(part, dict):
+                raise UserError(f"env_kwargs must be arguments of an environment by name, got {part!r}")
+        merged |= one
+        if "env_kwargs" in merged:
+            merged["env_kwargs"] = env_kwargs[0] | env_kwargs[1]
     return merged
 
 

@@ -12,6 +12,8 @@ import pytest
 import torch as th
 from made_runs import write_run
 from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_por import SACPOR
 from sb3_por.__main__ import main
@@ -19,7 +21,7 @@ from sb3_por.analysis import diagnostics, fresh_heads
 from sb3_por.analysis.controls import PlayedFrames, measure_controls, pairs_within_episodes
 from sb3_por.analysis.diagnostics import diagnose, diagnose_runs
 from sb3_por.analysis.fresh_heads import judgement, train_head
-from sb3_por.analysis.saliency import overlay, saliency_map
+from sb3_por.analysis.saliency import draw_saliency, overlay, saliency_map
 from sb3_por.common.errors import UserError
 from sb3_por.evaluation import load_safe
 from sb3_por.evaluation.loading import load_model
@@ -48,6 +50,18 @@ def test_an_untrained_classifier_is_at_chance_and_leaks_nothing(model):
     assert 0 <= diagnosis.accuracy <= 1 and 0 <= diagnosis.random_accuracy <= 1
     assert diagnosis.grad_norm_critic > 0 and diagnosis.grad_norm_por > 0
     assert diagnosis.as_dict() == diagnose(model, "FallingBall-v0", n_episodes=1).as_dict()
+
+
+def test_a_model_in_memory_is_measured_as_from_its_file(tmp_path):
+    env = VecNormalize(make_vec_env("Pendulum-v1", seed=0), norm_reward=False)
+    model = SACPOR("MlpPolicy", env, buffer_size=200, learning_starts=50, batch_size=8, seed=0).learn(60)
+    model.save(tmp_path / "model.zip")
+    env.save(str(tmp_path / "statistics.pkl"))
+    of_memory, of_file = (
+        diagnose(one, "Pendulum-v1", n_episodes=1, vec_normalize=str(tmp_path / "statistics.pkl")).as_dict()
+        for one in (model, tmp_path / "model.zip")
+    )
+    assert of_memory == of_file
 
 
 def test_a_balanced_weight_that_safe_loading_does_not_read_is_named(tmp_path):
@@ -153,6 +167,19 @@ def test_overlay_shows_the_frame_beside_its_heat():
     picture = overlay(frame, heat, size=40)
     assert picture.shape == (40, 80, 3)
     assert (picture[:, :40] == 200).all() and picture[0, 40].sum() > picture[39, 79].sum()
+    assert np.array_equal(overlay(frame[..., :1], heat, size=40), picture)
+
+
+def test_saliency_of_stacked_grey_frames_shows_the_last(tmp_path, monkeypatch):
+    def grey(env):
+        return gym.wrappers.GrayscaleObservation(env, keep_dim=True)
+
+    env = VecFrameStack(DummyVecEnv([lambda: grey(gym.make("FallingBall-v0", image_size=36))]), 3)
+    model = SACPOR("CnnPolicy", env, buffer_size=50, learning_starts=100)
+    shown = []
+    monkeypatch.setattr("sb3_por.analysis.saliency.overlay", lambda *args: shown.append(args[0]) or overlay(*args))
+    draw_saliency(model, "FallingBall-v0", tmp_path / "map.png", step=5, env_wrapper=grey)
+    assert shown[0].shape == (36, 36, 1)
 
 
 def test_a_model_without_an_order_is_refused():

@@ -33,6 +33,8 @@ def test_the_curve_says_what_it_shows():
     assert "PourWater-v0" in axes.get_title("left") and "95 %" in axes.get_title("left")
     single = plot(scores[scores["seed"] == 0])[0].figure.axes[0]
     assert "one seed, no interval" in single.get_title("left")
+    one_against_many = pd.concat([scores[scores["algo"] == "sac"], scores[(scores["algo"] != "sac") & (scores["seed"] == 0)]])
+    assert "95 %" in plot(one_against_many, "improvement", reps=50)[0].figure.axes[0].get_title("left")
 
 
 @pytest.mark.parametrize(
@@ -122,6 +124,9 @@ def test_the_order_is_read_from_runs_and_from_its_table(tmp_path):
     assert order["por_leak_loss"].isna().all() and order["encoder_grad_cosine"].isna().all()
     assert order["por_coef"].to_numpy() == pytest.approx(2 * order["por_loss"].to_numpy())
     write_order(order, tmp_path / "order.csv")
+    write_order(order.assign(por_loss=np.nan), tmp_path / "empty.csv")
+    with pytest.raises(UserError, match="the column por_loss is empty"):
+        read_order([tmp_path / "empty.csv"])
     pd.testing.assert_frame_equal(read_order([tmp_path / "order.csv"])[0], order)
     one, notes = plot_order(order)
     loss = one.table[one.table["metric"] == "por_loss"]

@@ -164,6 +164,24 @@ def test_a_page_of_runs_that_were_never_evaluated_names_their_failures(tmp_path)
     assert "no run was evaluated" in page.source and "MemoryError" in page.source and not page.images
 
 
+def test_a_run_that_died_has_no_scores_of_the_run_that_replaced_it(tmp_path):
+    for attempt in ("first", "second"):
+        write_run(tmp_path / attempt)
+    (tmp_path / "first" / "sac_por" / "PourWater-v0_1" / "evaluations.npz").unlink()
+    (tmp_path / "first" / "sac_por" / "PourWater-v0_1" / "best_model.zip").write_bytes(b"PK nonsense")
+    page = Page(write_report([tmp_path], tmp_path / "page"))
+    header, *rows = page.tables["runs"]
+    of_scores = [header.index(name) for name in ("last score", "best score", "hours")]
+    assert [[row[i] for i in of_scores] for row in rows] == [["-", "-", "-"], ["0.400", "0.400", "0.01"]]
+    assert "cannot be shown" not in page.source
+
+
+def test_settings_of_both_files_are_shown(tmp_path):
+    run = write_run(tmp_path, arguments={"env_kwargs": {"image_size": 48}})
+    (run / "PourWater-v0" / "config.yml").write_text(yaml.safe_dump({"env_kwargs": {"image_size": 64, "obs_type": "dict"}}))
+    assert take_inventory([run])[0].settings["env_kwargs"] == {"image_size": 48, "obs_type": "dict"}
+
+
 def test_a_corrupt_model_is_noted_and_the_page_written(tmp_path):
     run = write_run(tmp_path)
     (run / "best_model.zip").write_bytes(b"PK nonsense")

@@ -7,6 +7,7 @@ import yaml
 from made_runs import STEPS, write_run
 
 from sb3_por.analysis.figures import plot
+from sb3_por.analysis.learning_curves import read_grid
 from sb3_por.analysis.report import write_report
 from sb3_por.analysis.scores import COLUMNS, read_csv, read_run, read_scores, write_csv
 from sb3_por.common.errors import UserError
@@ -59,6 +60,16 @@ def test_a_table_written_and_read_is_the_same_table(tmp_path):
     pd.testing.assert_frame_equal(read_scores([tmp_path / "scores.csv"]), scores)
 
 
+def test_any_label_is_a_name(tmp_path):
+    for seed, label in enumerate(["None", "NA", "nan", 2]):
+        write_run(tmp_path / str(seed), seed=seed, label=label)
+    scores = read_scores([tmp_path])
+    assert set(scores["algo"]) == {"None", "NA", "nan", "2"}
+    write_csv(scores, tmp_path / "scores.CSV")
+    pd.testing.assert_frame_equal(read_scores([tmp_path / "scores.CSV"]), scores)
+    assert read_grid(scores).algos == sorted(set(scores["algo"]))
+
+
 def test_bad_scores_are_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken").mkdir()
@@ -66,6 +77,7 @@ def test_bad_scores_are_refused(tmp_path):
     cut_off = write_run(tmp_path / "cut") / "evaluations.npz"
     cut_off.write_bytes(cut_off.read_bytes()[:500])
     (tmp_path / "column.csv").write_text("env,algo\na,b\n")
+    (tmp_path / "nameless.csv").write_text("env,algo,seed,step\na,,1,2\n")
     (tmp_path / "header.csv").write_text("env,algo,seed,step\n")
     (tmp_path / "words.csv").write_text("env,algo,seed,step\na,b,one,2\n")
     write_run(tmp_path / "once", seed=1)
@@ -76,6 +88,7 @@ def test_bad_scores_are_refused(tmp_path):
         ("broken",): "cannot read",
         ("cut",): "cannot read",
         ("column.csv",): "has no column seed, step",
+        ("nameless.csv",): "a row has no algo",
         ("header.csv",): "holds no scores",
         ("words.csv",): "column seed must hold integers",
         ("missing.csv",): "cannot read",

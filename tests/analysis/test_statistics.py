@@ -112,13 +112,23 @@ def test_evaluations_at_different_steps_are_interpolated():
         iqm_curves(read_grid(apart))
 
 
+def test_a_seed_that_is_left_out_does_not_decide_the_step():
+    scores = pd.concat(
+        [table("a", env, seed, [0.0, 0.5, 1.0]) for env in "TU" for seed in (0, 1)] + [table("a", "T", 2, [0.0], steps=[100])]
+    )
+    grid = read_grid(scores)
+    step, matrices = grid.last()
+    assert step == 300 and matrices["a"].tolist() == [[1.0, 1.0]] * 2
+    assert grid.notes == ["a: 3 seeds on T but 2 elsewhere, so the first 2 are used"]
+
+
 def test_means_over_other_tasks_and_single_seeds_are_noted():
     grid = read_grid(
         pd.concat([table("a", "T", seed, [0.1, 0.2, 0.3]) for seed in (1, 2)] + [table("b", "U", 1, [0.1, 0.2, 0.3])])
     )
     iqm_curves(grid)
     assert grid.notes == [
-        "one seed of b: an interval over seeds has no width then, and tells nothing",
+        "one seed of b: how far its seeds differ is not known, and no interval includes it",
         "the algorithms were not run on the same tasks, so their means are of different ones; see --kind tasks",
     ]
 
@@ -131,7 +141,7 @@ def test_a_step_leaves_out_the_runs_that_end_before_it():
     assert curve["step"].tolist() == [100, 200, 250] and curve["iqm"].tolist() == pytest.approx([0.0, 0.2, 0.3])
     assert grid.notes == [
         "a on T, seed 2: evaluated from step 100 to 100, not at 250, so it is left out",
-        "one seed of a: an interval over seeds has no width then, and tells nothing",
+        "one seed of a: how far its seeds differ is not known, and no interval includes it",
     ]
     with pytest.raises(UserError, match="no run was evaluated at step 500; the last evaluation is at step 300"):
         read_grid(scores, step=500)

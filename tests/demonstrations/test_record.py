@@ -206,6 +206,7 @@ def change(path, name, value=None):
         (lambda path: change(path, "actions"), "cannot read episode 0"),
         (lambda path: change(path, "actions", np.zeros((3, 1))), r"actions of shape \(3, 1\)"),
         (lambda path: change(path, "rewards", np.full(4, np.nan)), "not finite"),
+        (lambda path: change(path, "observations", np.array(["text"] * 5, dtype=object)), "neither an array of numbers nor"),
         (lambda path: change(path, "observations", np.zeros((4, 3))), "4 steps need 5 observations"),
         (lambda path: (path / "main_data.hdf5").unlink(), "cannot read the Minari dataset"),
         (lambda path: (path / "main_data.hdf5").write_bytes(b"no HDF5"), "cannot read episode 0"),

@@ -253,6 +253,7 @@ def test_a_video_shows_the_steps_that_a_wrapper_makes_of_one(tmp_path):
         ExpertModel("PourWater-v0"), "PourWater-v0", path, size=64, env_wrapper=lambda env: ActionRepeat(env, repeat=10)
     )
     assert len(imageio.mimread(path, memtest=False)) == 101 and recorded.lengths == [100]
+    assert imageio.get_reader(path).get_meta_data()["fps"] == gym.make("PourWater-v0").metadata["render_fps"]
 
 
 def test_videos_of_odd_size_and_unknown_format(tmp_path):

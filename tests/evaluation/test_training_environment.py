@@ -259,7 +259,8 @@ def test_the_statistics_of_a_model_trained_from_python_are_asked_for(tmp_path):
     env.save(str(tmp_path / "statistics.pkl"))
     with pytest.warns(UserNote, match="Pendulum-v1 with normalize {'norm_obs': True"):
         evaluate(tmp_path / "model.zip", "Pendulum-v1", n_episodes=1)
-    scores(model, vec_normalize=str(tmp_path / "statistics.pkl"))
+    for given in (model, tmp_path / "model.zip"):
+        scores(given, vec_normalize=str(tmp_path / "statistics.pkl"))
 
 
 def test_an_episode_that_a_wrapper_ends_is_scored(tmp_path):

@@ -52,6 +52,12 @@ def test_the_buffer_never_holds_more_than_the_steps_of_the_run(runs):
     assert run_memory(runs(GRID.replace("image_size: 40", "no_such: 1"))[0]) == PROCESS
 
 
+def test_a_setting_that_is_no_number_is_for_its_run_to_refuse(runs):
+    whole = run_memory(runs(GRID.replace("buffer_size: 3000, ", ""))[0])
+    assert run_memory(runs(GRID.replace("buffer_size: 3000", "buffer_size: null"))[0]) == whole
+    assert run_memory(runs(GRID.replace("buffer_size: 3000", "frame_stack: '4'"))[0]) == whole
+
+
 def test_with_demonstrations_the_settings_are_theirs(runs):
     text = GRID.replace("FallingBall-v0", "FoldCloth-v0").replace(
         "hyperparams: {buffer_size: 3000, env_kwargs: {image_size: 40}}", ""

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import psutil
@@ -17,6 +18,7 @@ import pytest
 from disks import make_read_only, small_disk
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_runs import write_run
 from rich.console import Console
 
 from sb3_por.__main__ import main
@@ -69,6 +71,31 @@ def test_a_variant_is_an_algorithm_with_settings_and_a_name(suite_file, tmp_path
     assert variant.name == "PourWater-v0/por_paper/seed_0"
     command = " ".join(variant.command())
     assert "--algo sac_por" in command and "--label por_paper" in command
+
+
+def test_a_run_in_a_namespace_is_found_where_the_zoo_writes_it(suite_file, tmp_path):
+    gym.register("ours/Pend-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=20)
+    try:
+        run = suite_runs(read_suite(suite_file("algos: [sac]\nenvs: [ours/Pend-v0]\nseeds: [0]\n")), tmp_path)[0]
+    finally:
+        del gym.registry["ours/Pend-v0"]
+    assert run.state() == "new" and run.run_folder.name == "ours-Pend-v0_1"
+    write_run(run.folder, "sac", "ours-Pend-v0")
+    assert run.state() == "interrupted"
+    (run.run_folder / "ours-Pend-v0.zip").touch()
+    assert run.state() == "finished"
+
+
+def test_narrow_env_kwargs_add_to_wide_ones(suite_file, tmp_path):
+    text = "algos: [sac_por, v]\nenvs: [PourWater-v0]\nseeds: [0]\n"
+    text += "hyperparams: {env_kwargs: {image_size: 48, obs_type: dict}}\n"
+    text += "variants: {v: {algo: sac_por, env_kwargs: {image_size: 32}}}\n"
+    text += "overrides: {PourWater-v0: {env_kwargs: {max_episode_steps: 20}}}\n"
+    kwargs = [eval(run.flags[-1].removeprefix("env_kwargs:")) for run in suite_runs(read_suite(suite_file(text)), tmp_path)]
+    assert kwargs[0] == {"image_size": 48, "obs_type": "dict", "max_episode_steps": 20}
+    assert kwargs[1] == kwargs[0] | {"image_size": 32}
+    with pytest.raises(UserError, match=r"env_kwargs must be arguments of an environment by name, got \[1\]"):
+        suite_runs(read_suite(suite_file(text.replace("{max_episode_steps: 20}", "[1]"))), tmp_path)
 
 
 def test_each_run_has_the_demonstrations_of_its_environment(suite_file, tmp_path):

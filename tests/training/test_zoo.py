@@ -201,6 +201,10 @@ def test_runs_started_together_get_folders_of_their_own(tmp_path, monkeypatch):
         (["--algo", "sac", "-params", "env_wrapper:no_such.Wrapper"], "No module named 'no_such'"),
         (["--algo", "sac", "-params", "policy_kwargs:'dict('"], "was never closed"),
         (["--algo", "sac", "-params", "learning_rate:1e-3x"], "learning_rate must be a number, or lin_NUMBER"),
+        (
+            ["--algo", "sac", "-params", "n_envs:2", "train_freq:(1,'episode')"],
+            "train_freq in episodes needs one environment",
+        ),
         (["--algo", "sac", "-params", "n_envs:0"], "n_envs must be a whole number of at least 1, got 0"),
         (["--algo", "sac", "-params", "frame_stack:2.0"], "frame_stack must be a whole number of at least 1, got 2.0"),
         (["--algo", "sac", "-params", "noise_type:normal"], "noise_type needs noise_std"),
@@ -358,6 +362,15 @@ def test_a_word_is_a_word_though_python_knows_it():
     given = parser.parse_args(["--settings", "obs_type:dict", "pairing:paper", "gamma:0.9", "f:lambda x: x"]).settings
     assert given.pop("f")(3) == 3
     assert given == {"obs_type": "dict", "pairing": "paper", "gamma": 0.9}
+
+
+def test_yamls_words_are_values_and_a_flag_given_again_adds():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--settings", nargs="+", action=Settings)
+    words = ["--settings", "keep_hold:false", "a:True", "b:null", "--settings", "pairing:paper", "b:1"]
+    assert parser.parse_args(words).settings == {"keep_hold": False, "a": True, "b": 1, "pairing": "paper"}
+    parser.set_defaults(settings={"of": "before"})
+    assert parser.parse_args(["--settings", "k:3"]).settings == {"k": 3}, "defaults are replaced"
 
 
 def test_images_that_are_flattened_are_said(capsys):

@@ -438,6 +438,15 @@ def test_settings_at_the_papers_scale_build_the_papers_encoder(algo):
     assert model.critic.projection.block_dims == [32 * 57 * 57]
 
 
+def test_the_recipe_of_drq_v2_trains(tmp_path):
+    file = ROOT / "zoo_hyperparams" / "paper" / "drq_v2.yml"
+    small = ["buffer_size:50", "batch_size:4", "learning_starts:10", "policy_kwargs:{'net_arch':[8]}"]
+    flags = ["--algo", "sac_drq", "--env", "PourWater-v0", "-conf", str(file), "--label", "drq_v2", "-n", "14", "--seed", "0"]
+    assert main([*flags, "--eval-freq", "14", "--eval-episodes", "1", "-f", str(tmp_path), "-params", *small]) == 0
+    model = load_model(tmp_path / "sac_drq" / "PourWater-v0_1" / "PourWater-v0.zip")
+    assert model.observation_space.shape == (9, 84, 84) and model.n_steps == 3 and model._n_updates == 2
+
+
 def test_tracking_without_its_package_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main([*PENDULUM, "--track"]) == 2

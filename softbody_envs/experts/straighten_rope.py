@@ -9,15 +9,21 @@ from softbody_envs.tasks.straighten_rope import LOW
 
 #: Distance between picker and end of the rope at which the picker grasps, m. It grasps again if the end is farther away.
 CLOSE = 0.015
+#: Height above an end at which a picker that cannot open travels to it, out of reach of the rope, m.
+TRAVEL_HEIGHT = 0.07
 #: Smallest distance between the ends at which it defines the direction of the pull, m.
 APART = 0.01
 
 
 class StraightenRopeExpert:
-    """Sends each picker to the closer end. Once both hold, they move apart along the line through the ends."""
+    """
+    Sends each picker to the closer end. Once both hold, they move apart along the line through the ends. Pickers that cannot
+    open would grasp what lies on their way: they come from above, and keep what they have got.
+    """
 
     def __init__(self, pace: Pace = FULL_SPEED) -> None:
         self._reach = REACH * pace.stride
+        self._keep_hold = pace.keep_hold
         self.reset()
 
     def reset(self) -> None:
@@ -33,7 +39,12 @@ class StraightenRopeExpert:
         if self._swapped:
             ends = ends[::-1]
         offsets = np.maximum(ends, LOW) - pickers
-        near = np.linalg.norm(offsets, axis=1) < CLOSE
+        if self._keep_hold:
+            offsets[np.linalg.norm(offsets[:, :2], axis=1) >= CLOSE, 2] += TRAVEL_HEIGHT
+            offsets[holds] = 0.0
+            near = np.full(2, True)
+        else:
+            near = np.linalg.norm(offsets, axis=1) < CLOSE
         picks = np.where(near, 1.0, -1.0)
         if (holds & near).all():
             offsets = self._targets(ends) - ends

@@ -435,6 +435,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "trials": lambda: evaluations("trials"),
     "progress": lambda: evaluations("progress"),
     "pour": lambda: evaluations("pour"),
+    "figure4_pour": lambda: evaluations("figure4_pour"),
     "demos": lambda: evaluations("demos"),
     "rope": lambda: evaluations("rope"),
     "sparse": lambda: evaluations("sparse"),

@@ -1,5 +1,7 @@
 """Runs and tables of scores made for tests."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import yaml
@@ -41,8 +43,8 @@ def write_run(
 
 
 def log_order(folder, losses, first_step=100, returns=()):
-    """TensorBoard files as a run of POR writes them, perhaps with the mean returns of its evaluations."""
-    with SummaryWriter(folder) as writer:
+    """A TensorBoard file as a run of POR writes it, perhaps with the mean returns of its evaluations; after those there are."""
+    with SummaryWriter(folder, filename_suffix=".new") as writer:
         for step, mean_return in zip(STEPS, returns, strict=False):
             writer.add_scalar("eval/mean_reward", mean_return, step)
         for i, loss in enumerate(losses):
@@ -51,6 +53,9 @@ def log_order(folder, losses, first_step=100, returns=()):
             writer.add_scalar("train/encoder_grad_norm_critic", 10.0, first_step + 100 * i)
             writer.add_scalar("train/encoder_grad_norm_por", loss, first_step + 100 * i)
             writer.add_scalar("train/por_coef", 2 * loss, first_step + 100 * i)
+    # Files are read in the order of their names, which begin with the second: made within one second, 10 would come before 9
+    (written,) = Path(folder).glob("*.new")
+    written.rename(written.with_name(f"events.out.tfevents.{len(list(written.parent.iterdir())):010d}.made"))
 
 
 def table(algo, env, seed, performance, steps=STEPS):

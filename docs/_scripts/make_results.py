@@ -1,5 +1,5 @@
 """
-Fill in the tables of the pages in PAGES from results/, and draw their figures.
+Fill in the tables of the pages in PAGES from results/ and docstrings, and draw their figures.
 
     python docs/_scripts/make_results.py              tables only
     python docs/_scripts/make_results.py --figures    and the figures
@@ -8,6 +8,7 @@ A table stands between `<!-- table: NAME -->` and `<!-- end -->`; ``TABLES`` map
 """
 
 import argparse
+import inspect
 import re
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -17,10 +18,16 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 from scipy.integrate import trapezoid
+from stable_baselines3 import SAC
 
 from sb3_por.analysis.figures import plot, plot_order
 from sb3_por.analysis.por_logs import read_order
 from sb3_por.analysis.scores import read_scores
+from sb3_por.ranking import RankedProgress
+from sb3_por.visual.encoders import ConvEncoder
+from sb3_por.visual.sac import VisualSAC
+from softbody_envs.env import SoftbodyEnv
+from softbody_envs.wrappers import ActionRepeat, Distraction, ProgressReward, ShowQuantity, SuccessReward
 
 DOCS = Path(__file__).parents[1]
 RESULTS = DOCS.parent / "results"
@@ -28,6 +35,9 @@ RESULTS = DOCS.parent / "results"
 ALGOS = ("sac_por", "sac_drq", "sac_curl", "sac_spr", "sac")
 PAGES = (
     "results.md",
+    "algorithms.md",
+    "usage.md",
+    "tasks/README.md",
     "lab/full_speed.md",
     "lab/trials.md",
     "por.md",
@@ -419,6 +429,31 @@ def metrics_of(objective: str) -> str:
     return "\n".join(["| metric | meaning | usual | worry if |", "| --- | --- | --- | --- |", *rows])
 
 
+def arguments_of(documented: type, base: type | None = None) -> str:
+    """The arguments of a class that its base does not have, or has with another default, as its docstring explains them."""
+    own, inherited = (inspect.signature(cls.__init__).parameters if cls else {} for cls in (documented, base))
+    rows = []
+    for name, text in re.findall(r":param (\w+): (.*?)(?=\n *:param |\n *\Z)", inspect.getdoc(documented) + "\n", re.DOTALL):
+        default = own[name].default
+        if default is inspect.Parameter.empty or (name in inherited and inherited[name].default == default):
+            continue
+        meaning = re.sub(r"\s+", " ", text).replace("``", "`")
+        shown = f'"{default}"' if isinstance(default, str) else str(default)
+        rows.append((f"`{name}`", f"`{shown}`", meaning + (f"; SB3: {inherited[name].default}" if name in inherited else "")))
+    return markdown(("argument", "default", "meaning"), rows)
+
+
+def wrappers_of(*wrappers: type) -> str:
+    """Wrappers of environments with their arguments, as the first sentence of each docstring explains them."""
+    rows = []
+    for wrapper in wrappers:
+        _, _, *arguments = inspect.signature(wrapper.__init__).parameters.values()  # without self and the environment
+        shown = ", ".join(str(argument.replace(annotation=inspect.Parameter.empty)) for argument in arguments)
+        sentence = re.split(r"(?<=\.)\s", inspect.getdoc(wrapper), maxsplit=1)[0]
+        rows.append((f"`{wrapper.__name__}`", f"`{shown}`", re.sub(r"\s+", " ", sentence).replace("``", "`")))
+    return markdown(("wrapper", "arguments", ""), rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "comparison": lambda: comparison("main"),
     "rivals": rivals,
@@ -454,6 +489,10 @@ TABLES: dict[str, Callable[[], str]] = {
     "metrics_curl": lambda: metrics_of("curl"),
     "metrics_spr": lambda: metrics_of("spr"),
     "metrics_mrq": lambda: metrics_of("mrq"),
+    "arguments": lambda: arguments_of(VisualSAC, SAC),
+    "arguments_encoder": lambda: arguments_of(ConvEncoder),
+    "arguments_env": lambda: arguments_of(SoftbodyEnv),
+    "wrappers": lambda: wrappers_of(ActionRepeat, ProgressReward, SuccessReward, RankedProgress, Distraction, ShowQuantity),
     **{f"scores_{algo}": partial(scores_of, algo) for algo in ALGOS},
 }
 

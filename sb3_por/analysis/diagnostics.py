@@ -53,8 +53,9 @@ class Diagnosis:
     :param random_loss: POR loss on frames of a random policy
     :param random_accuracy: accuracy on them
     :param grad_norm_critic: norm of the critic loss's gradient with respect to the encoder, for the task's own rewards even
-        where ``VecNormalize`` scales them in training
-    :param grad_norm_por: norm of the weighted POR loss's gradient with respect to the encoder
+        where ``VecNormalize`` scales them in training; NaN for an exported model, which holds no Q networks
+    :param grad_norm_por: norm of the weighted POR loss's gradient with respect to the encoder; NaN for an exported model, and
+        where a weight balances gradients but was not read (safe loading)
     :param feature_std: standard deviation of the encoder's features over the policy's own frames, mean over features; near 0
         the encoder has collapsed to a constant
     :param n_unchanged: pairs of an episode, k steps apart, with equal quantities
@@ -102,13 +103,12 @@ class Diagnosis:
             "leak control (k = 0)": (self.leak_loss, self.leak_accuracy),
             "chance": (np.log(2), 0.5),
         }
-        # A weight that balances gradients is not in what safe loading reads
-        of_por = "unknown (loaded safely)" if np.isnan(self.grad_norm_por) else f"{self.grad_norm_por:.3g}"
+        norms = [f"{norm:.3g}" if np.isfinite(norm) else "unknown" for norm in (self.grad_norm_critic, self.grad_norm_por)]
         orders = {ORDERS[name]: [getattr(order, measure) for measure in MEASURES] for name, order in self.orders.items()}
         return "\n".join(
             (
                 _printed(pairs, ("loss", "accuracy")),
-                f"gradient norm with respect to the encoder: critic {self.grad_norm_critic:.3g}, POR {of_por}",
+                f"gradient norm with respect to the encoder: critic {norms[0]}, POR {norms[1]}",
                 f"standard deviation of the encoder's features over frames: {self.feature_std:.3g}",
                 "",
                 "Spearman correlation r with the monotone quantity, and accuracy on pairs:",
@@ -126,7 +126,7 @@ def check_order(model: Any) -> PartialOrder:
     """
     objective = getattr(getattr(model, "policy", None), "objective", None)
     if not isinstance(objective, PartialOrder):
-        raise UserError(f"{type(model).__name__} learns no order; use a model of sac_por or tqc_por")
+        raise UserError(f"{type(model).__name__} learns no order; use a model of sac_por or tqc_por (with --pretrained, name one by --algo)")
     return objective
 
 
@@ -158,8 +158,6 @@ def diagnose(
     """
     model, environment = resolve(model, env_id, env_kwargs, vec_normalize, env_wrapper, vec_env_wrapper)
     objective = check_order(model)
-    if getattr(model, LACKS_VALUES, False):
-        raise UserError("an exported model holds no Q networks, whose gradients a diagnosis measures; diagnose its run")
     if n_episodes < 1:
         raise UserError(f"a diagnosis needs at least 1 episode, got {n_episodes}")
     env = make_evaluation_env(model, env_id, **environment)
@@ -178,7 +176,8 @@ def diagnose(
     measured = [model.objective_metrics(batch) for batch in batches]
     leaks = [model.control_metrics(batch) for batch in batches]
     at_random = [model.objective_metrics(model.sample(BATCH_SIZE, random.transitions)) for _ in range(N_BATCHES)]
-    norms = model.encoder_grad_norms(model.losses(batches[0]))
+    # What was exported holds no Q networks, and a weight may follow their gradients
+    norms = {} if getattr(model, LACKS_VALUES, False) else model.encoder_grad_norms(model.losses(batches[0]))
     features = encode(model.critic, own.observations, model.device)
     potential, belief = judgement(objective, features)
     k = _distances(objective)[-1]
@@ -193,8 +192,8 @@ def diagnose(
         leak_accuracy=_mean(leaks, "leak_accuracy"),
         random_loss=_mean(at_random, "loss"),
         random_accuracy=_mean(at_random, "accuracy"),
-        grad_norm_critic=float(norms["critic"]),
-        grad_norm_por=float(norms[objective.name]),
+        grad_norm_critic=float(norms.get("critic", np.nan)),
+        grad_norm_por=float(norms.get(objective.name, np.nan)),
         feature_std=float(features.std(dim=0).mean()),
         n_unchanged=int(unchanged.sum()),
         n_changed=int(changed.sum()),

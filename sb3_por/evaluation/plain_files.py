@@ -12,6 +12,7 @@ import numpy as np
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_por.common.errors import UserError
@@ -31,8 +32,9 @@ _TENSOR_NAMES = {
     *("collections OrderedDict", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter"),
     *(f"torch {kind}Storage" for kind in _KINDS),
 }
-#: Parameters that only learning needs: the networks of the values
+#: Parameters that only learning needs: the networks of the values, then what an objective that is kept needs as well
 _VALUES = re.compile(r"critic(_target)?\.qf\d+\.")
+_LEARNING = re.compile(rf"{_VALUES.pattern}|critic_target\.|objective\.")
 
 
 def read_json(path: Path, member: str = DATA) -> dict[str, Any]:
@@ -88,16 +90,17 @@ def read_tensors(path: Path) -> dict[str, th.Tensor]:
 
 def save_plain(model: BaseAlgorithm, path: Path, statistics: dict[str, Any] | None = None) -> None:
     """
-    Save what playing needs: description, environment and networks without those of the values; no optimizer, no pickled code.
-    ``load_safe`` reads it, SB3's ``load`` does not.
+    Save what playing needs, and a diagnosis of an order: description, environment and networks without those of the values, the
+    target's, and an objective's that is not kept; no optimizer, no pickled code. ``load_safe`` reads it, SB3's ``load`` does not.
 
     :param model: A model
     :param path: ``.zip`` to write
     :param statistics: ``VecNormalize`` statistics that the model plays with, see ``describe_statistics``
     """
     stored = {name: vars(model)[name] for name in (environment.ATTRIBUTE, "num_timesteps") if name in vars(model)}
+    needless = _needless(model.policy)
     tensors = {
-        name: tensor.cpu().contiguous() for name, tensor in model.policy.state_dict().items() if not _VALUES.match(name)
+        name: tensor.cpu().contiguous() for name, tensor in model.policy.state_dict().items() if not needless.match(name)
     }
     networks = io.BytesIO()
     th.save(tensors, networks)
@@ -109,9 +112,14 @@ def save_plain(model: BaseAlgorithm, path: Path, statistics: dict[str, Any] | No
             archive.writestr(STATISTICS, json.dumps(statistics))
 
 
-def lacks_values(names: set[str]) -> bool:
-    """Whether all of some missing parameters are such as ``save_plain`` leaves out."""
-    return all(_VALUES.match(name) for name in names)
+def may_lack(policy: BasePolicy, names: set[str]) -> bool:
+    """Whether all of some missing parameters of a policy are such as ``save_plain`` leaves out."""
+    return all(_needless(policy).match(name) for name in names)
+
+
+def _needless(policy: BasePolicy) -> re.Pattern[str]:
+    """What the names of parameters start with that neither playing nor a diagnosis needs."""
+    return _VALUES if getattr(getattr(policy, "objective", None), "kept", False) else _LEARNING
 
 
 def describe_statistics(statistics: VecNormalize) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from sb3_por.common import plain
 from sb3_por.common.checks import check_types
 from sb3_por.common.errors import UserError, check_known, one_line, short
 from sb3_por.evaluation.model_files import LOADABLE, candidates, model_file
-from sb3_por.evaluation.plain_files import lacks_values, read_json, read_tensors
+from sb3_por.evaluation.plain_files import may_lack, read_json, read_tensors
 from sb3_por.runs.environment import TrainingEnvironment, without_ranker
 from sb3_por.runs.folder import ClassName
 from sb3_por.visual import encoders
@@ -66,7 +66,7 @@ def load_safe(
 
     Algorithm, policy and their arguments come from names and numbers in the file, weights from its tensors. Pickled values are
     never read; a model that cannot be rebuilt without them is refused. The model plays: its optimizers are new, its replay
-    buffer holds one transition, and a file of ``export`` has no Q networks.
+    buffer holds one transition, and a file of ``export`` has no Q networks, and other networks that only learning needs.
 
     :param path: A model's ``.zip``, or a run folder, which stands for its ``best_model.zip``
     :param env: Environment, or its id, that gives the spaces; needed for files that do not describe them
@@ -218,7 +218,7 @@ def _build(description: dict[str, Any], device: th.device | str) -> BaseAlgorith
 def _load_networks(model: BaseAlgorithm, tensors: dict[str, th.Tensor]) -> None:
     own = model.policy.state_dict()
     missing, unexpected = set(own) - set(tensors), set(tensors) - set(own)
-    if unexpected or not lacks_values(missing):
+    if unexpected or not may_lack(model.policy, missing):
         names = sorted(unexpected or missing)
         raise ValueError(f"{len(names)} tensors do not fit a {type(model.policy).__name__}, {names[0]!r:.80} among them")
     model.policy.load_state_dict({**own, **tensors})

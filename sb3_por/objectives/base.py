@@ -61,6 +61,8 @@ class Objective(nn.Module, ABC):
     #: Whether an optimizer of its own steps the encoder and the objective; else the weighted loss is added to the critic's.
     #: Adam's step size does not depend on the scale of a loss, so the critic cannot drown out an objective with an optimizer
     own_optimizer: bool = False
+    #: Whether a trained objective tells something about frames, as an order does; else exported agents go without it
+    kept: bool = True
 
     def __init__(self, features_dim: int, action_dim: int):
         super().__init__()

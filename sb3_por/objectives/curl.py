@@ -21,6 +21,7 @@ class Contrastive(Objective):
     name = "curl"
     positive = True
     own_optimizer = True
+    kept = False
 
     def __init__(self, features_dim: int, action_dim: int):
         super().__init__(features_dim, action_dim)

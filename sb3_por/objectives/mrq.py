@@ -41,6 +41,7 @@ class ModelBased(Objective):
 
     name = "mrq"
     own_optimizer = True
+    kept = False
 
     def __init__(self, features_dim: int, action_dim: int, horizon: int = 5):
         super().__init__(features_dim, action_dim)

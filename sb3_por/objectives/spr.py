@@ -27,6 +27,7 @@ class SelfPredictive(Objective):
 
     name = "spr"
     own_optimizer = True
+    kept = False
 
     def __init__(self, features_dim: int, action_dim: int, horizon: int = 5):
         super().__init__(features_dim, action_dim)

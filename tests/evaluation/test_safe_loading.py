@@ -92,9 +92,23 @@ def test_a_plain_file_holds_no_pickle_and_plays_the_same(tmp_path):
     for loaded in (load_safe(tmp_path / "plain.zip"), load_model(tmp_path / "plain.zip")):
         assert np.array_equal(actions(loaded), actions(model))
     names = set(plain_files.read_tensors(tmp_path / "plain.zip"))
-    assert names < set(model.policy.state_dict()) and not any(".qf" in name for name in names)
+    assert {name for name in model.policy.state_dict() if ".qf" not in name} == names
     with pytest.raises(UserError, match="is a model of 'SACPOR', not of sac_drq"):
         load_model(tmp_path / "plain.zip", algo="sac_drq")
+
+
+@pytest.mark.parametrize("cls", [SACCURL, SACSPR, SACMRQ, SACDrQ])
+def test_a_plain_file_goes_without_what_only_learning_needs(cls, tmp_path):
+    model = cls("CnnPolicy", DotEnv(size=32), policy_kwargs=POLICY, buffer_size=20, device="cpu")
+    save_plain(model, tmp_path / "plain.zip")
+    names = set(plain_files.read_tensors(tmp_path / "plain.zip"))
+    assert {name.split(".")[0] for name in names} == {"actor", "critic"} and not any(".qf" in name for name in names)
+    loaded = load_safe(tmp_path / "plain.zip")
+    assert np.array_equal(actions(loaded), actions(model))
+    fresh = SACDrQ("CnnPolicy", DotEnv(size=32), policy_kwargs=POLICY, buffer_size=20, device="cpu")
+    fresh.load_encoder(loaded)  # what it learned to see can be used
+    encoders = (one.critic.features_extractor.state_dict() for one in (fresh, model))
+    assert all(th.equal(a, b) for a, b in zip(*(encoder.values() for encoder in encoders), strict=True))
 
 
 @pytest.mark.parametrize("which", ["por_zip", "sac_zip"])

@@ -109,9 +109,11 @@ def test_enjoy_pretrained_makes_a_video(pretrained, tmp_path, capsys):
     assert "not allowed with argument" in capsys.readouterr().err
 
 
-def test_a_diagnosis_needs_more_than_an_exported_agent_holds(pretrained, capsys):
-    assert main(["diagnose", "--env", "PourWater-v0", "--pretrained"]) == 2
-    assert "an exported model holds no Q networks" in capsys.readouterr().err
+def test_an_exported_agent_is_diagnosed_without_the_gradients_of_its_q_networks(pretrained, capsys):
+    assert main(["diagnose", "--env", "PourWater-v0", "--pretrained", "-n", "1", "--json"]) == 0
+    diagnosis = json.loads(capsys.readouterr().out)
+    assert diagnosis["grad_norm_critic"] is None and diagnosis["grad_norm_por"] is None
+    assert 0 <= diagnosis["accuracy"] <= 1 and diagnosis["feature_std"] > 0
 
 
 @pytest.mark.parametrize("algo, normalize", [("sac", True), ("tqc", False), ("ppo", True)])

@@ -126,7 +126,8 @@ def check_order(model: Any) -> PartialOrder:
     """
     objective = getattr(getattr(model, "policy", None), "objective", None)
     if not isinstance(objective, PartialOrder):
-        raise UserError(f"{type(model).__name__} learns no order; use a model of sac_por or tqc_por (with --pretrained, name one by --algo)")
+        how = "use a model of sac_por or tqc_por (with --pretrained, name one by --algo)"
+        raise UserError(f"{type(model).__name__} learns no order; {how}")
     return objective
 
 

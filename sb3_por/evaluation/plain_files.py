@@ -90,8 +90,9 @@ def read_tensors(path: Path) -> dict[str, th.Tensor]:
 
 def save_plain(model: BaseAlgorithm, path: Path, statistics: dict[str, Any] | None = None) -> None:
     """
-    Save what playing needs, and a diagnosis of an order: description, environment and networks without those of the values, the
-    target's, and an objective's that is not kept; no optimizer, no pickled code. ``load_safe`` reads it, SB3's ``load`` does not.
+    Save what playing and the diagnosis of an order need: description, environment, and networks without those of the values,
+    of the target, and of an objective that is not kept; no optimizer, no pickled code. ``load_safe`` reads it, SB3's ``load``
+    does not.
 
     :param model: A model
     :param path: ``.zip`` to write

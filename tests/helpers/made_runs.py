@@ -43,7 +43,7 @@ def write_run(
 
 
 def log_order(folder, losses, first_step=100, returns=()):
-    """A TensorBoard file as a run of POR writes it, perhaps with the mean returns of its evaluations; after those there are."""
+    """A TensorBoard file as a run of POR writes it, read after those that are there; with mean returns of its evaluations."""
     with SummaryWriter(folder, filename_suffix=".new") as writer:
         for step, mean_return in zip(STEPS, returns, strict=False):
             writer.add_scalar("eval/mean_reward", mean_return, step)

@@ -43,7 +43,8 @@ class Rope:
         client = world.client
         # Strong damping and stiff joints: a segment that spins fast would leave its joints within one step. The contact
         # threshold is below the gap of 7 mm between neighbours: Bullet's default of 2 cm would make each pair a contact.
-        client.setPhysicsEngineParameter(numSolverIterations=10, erp=1.0, contactBreakingThreshold=0.004)
+        client.setPhysicsEngineParameter(numSolverIterations=10, erp=1.0)
+        world.contact_breaking_threshold = 0.004
         shape = client.createCollisionShape(pybullet.GEOM_SPHERE, radius=RADIUS)
         look, end_look = (
             client.createVisualShape(pybullet.GEOM_CAPSULE, radius=RADIUS, length=SPACING, rgbaColor=color)

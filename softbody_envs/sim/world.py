@@ -9,6 +9,8 @@ from softbody_envs.sim.client import Client
 #: Duration of a control step, s (SoftGym: 8 steps of 0.01 s).
 CONTROL_PERIOD = 0.08
 GRAVITY = -9.8
+#: Bullet's default distance at which a contact ends, m.
+CONTACT_BREAKING_THRESHOLD = 0.02
 
 
 @dataclass(frozen=True)
@@ -38,12 +40,15 @@ class World:
         self.deformable = deformable
         #: Floor of the scene, if there is one.
         self.floor: Floor | None = None
+        #: Distance at which a contact ends, m; a task may set it after ``clear``.
+        self.contact_breaking_threshold = CONTACT_BREAKING_THRESHOLD
         self.client = Client()
 
     def clear(self) -> None:
         """Remove all bodies and apply all settings again: ``resetSimulation`` resets some settings and keeps others."""
         self.client.resetSimulation(pybullet.RESET_USE_DEFORMABLE_WORLD if self.deformable else 0)
         self.floor = None
+        self.contact_breaking_threshold = CONTACT_BREAKING_THRESHOLD
         self.client.setGravity(0.0, 0.0, GRAVITY)
         # File caching would serve an old mesh under a reused name (bullet#2277).
         self.client.setPhysicsEngineParameter(
@@ -52,6 +57,8 @@ class World:
 
     def step(self) -> None:
         """Advance by ``time_step`` seconds."""
+        # One variable for the whole process, which another world may have set
+        self.client.setPhysicsEngineParameter(contactBreakingThreshold=self.contact_breaking_threshold)
         self.client.stepSimulation()
 
     def close(self) -> None:

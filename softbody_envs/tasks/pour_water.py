@@ -139,9 +139,7 @@ class PourWaterEnv(SoftbodyEnv):
         )
         gap = rng.uniform(0.08, 0.22)
 
-        world.client.setPhysicsEngineParameter(
-            numSolverIterations=10, contactBreakingThreshold=0.02, minimumSolverIslandSize=1024
-        )
+        world.client.setPhysicsEngineParameter(numSolverIterations=10, minimumSolverIslandSize=1024)
         world.add_floor(-SINK_DEPTH)
         self.cup = Cup(world, size, x=0.0, color=(0.93, 0.80, 0.55, 1.0))
         self.target = Cup(

@@ -146,9 +146,11 @@ class SoftbodyEnv(gym.Env, EzPickle, ABC):
         :raises ValueError: if an option is unknown, the index is out of range, or the variation starts solved
         """
         super().reset(seed=seed)
-        options = options or {}
+        options = {} if options is None else options
+        if not isinstance(options, dict):
+            raise ValueError(f'options must be a dict such as {{"variation": 3}}, got {options!r}')
         if unknown := set(options) - {"variation"}:
-            raise ValueError(f'reset knows the option "variation" only, got {", ".join(map(repr, sorted(unknown)))}')
+            raise ValueError(f'reset knows the option "variation" only, got {", ".join(sorted(map(repr, unknown)))}')
         if "variation" in options:
             self.variation = check_variation(options["variation"])
         else:

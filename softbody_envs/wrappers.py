@@ -34,9 +34,15 @@ class ActionRepeat(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Reco
             self.metadata = env.metadata | {"render_fps": env.metadata["render_fps"] / self.repeat}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """See ``gymnasium.Env.step``. Observation and info are those of the last repetition."""
+        """
+        See ``gymnasium.Env.step``. Observation and info are those of the last repetition.
+
+        :raises ValueError: If the action has another shape than the space
+        """
         space = self.action_space
         assert isinstance(space, gym.spaces.Box)
+        if np.shape(action) != space.shape:
+            raise ValueError(f"an action has the shape {space.shape}, got {np.shape(action)}")
         scaled = self.scale * np.clip(action, space.low, space.high)
         total = 0.0
         for _ in range(self.repeat):
@@ -163,7 +169,7 @@ class Distraction(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Recor
         ``"drift"``, steadily to the right: an arrow of time that has nothing to do with the task
     :param strength: Weight of the texture, from 0 to 1
     :param jitter: Largest random shift of the picture in each direction, pixels
-    :raises ValueError: If an argument is out of range, or ``env`` does not observe images
+    :raises ValueError: If an argument is out of range, or ``env`` does not observe square RGB images of uint8
     """
 
     #: Steps of a swing to and fro
@@ -175,8 +181,8 @@ class Distraction(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Recor
         gym.utils.RecordConstructorArgs.__init__(self, motion=motion, strength=strength, jitter=jitter)
         gym.Wrapper.__init__(self, env)
         space = env.observation_space
-        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 3:
-            raise ValueError(f"Distraction needs an environment that observes images, got {space}")
+        if space.shape is None or space.dtype != np.uint8 or space.shape != (space.shape[0], space.shape[0], 3):
+            raise ValueError(f"Distraction needs square RGB images of uint8, channels last, got {space}")
         if motion not in ("swing", "drift"):
             raise ValueError(f"motion must be 'swing' or 'drift', got {motion!r}")
         if not 0.0 <= strength <= 1.0 or jitter < 0:

@@ -40,6 +40,7 @@ class OverlappedTraining(OffPolicyAlgorithm):
     """
 
     overlap: bool
+    actor: Any
     _defers_updates = False
     _updates_due = 0
 
@@ -67,6 +68,8 @@ class OverlappedTraining(OffPolicyAlgorithm):
             updates, self._updates_due = self._updates_due, 0
             self.train(updates, self.batch_size)
             self.policy.set_training_mode(False)
+            if self.use_sde:  # the update has drawn one noise matrix for its batch
+                self.actor.reset_noise(self.n_envs)
 
     def learn(
         self,

@@ -13,7 +13,7 @@ ATTRIBUTE = "plain_description"
 #: Arguments of an algorithm that have no place in a description: they concern learning, memory or the machine
 LEFT_OUT = (
     *("policy", "env", "policy_kwargs", "device", "_init_setup_model", "seed", "verbose", "tensorboard_log"),
-    *("buffer_size", "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage"),
+    *("buffer_size", "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage", "demos"),
     *("rollout_buffer_class", "rollout_buffer_kwargs", "action_noise", "train_freq", "overlap", "precision", "compile_mode"),
 )
 #: Arguments of a policy that have no place in a description: an algorithm gives them, or only learning needs them

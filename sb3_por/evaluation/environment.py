@@ -111,6 +111,11 @@ def _stack(env: VecEnv, space: spaces.Space) -> VecEnv:
 def _normalize(env: VecEnv, statistics: str) -> VecEnv:
     if statistics.endswith(".zip"):
         return normalize(env, read_json(Path(statistics), STATISTICS))
-    env = VecNormalize.load(statistics, env)
+    try:
+        env = VecNormalize.load(statistics, env)
+    except AssertionError:  # statistics of another shape
+        raise
+    except Exception as error:  # whatever a damaged pickle raises
+        raise UserError(f"cannot read the statistics of observations {statistics}: {one_line(error)}") from error
     env.training = env.norm_reward = False
     return env

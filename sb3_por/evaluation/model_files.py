@@ -3,6 +3,7 @@
 import inspect
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import sb3_contrib
 import stable_baselines3
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_por import ALGORITHMS
+from sb3_por import ALGORITHMS, VisualSAC, VisualTQC
 from sb3_por.common import plain
 from sb3_por.common.errors import UserError, one_line
 from sb3_por.runs.folder import ARGUMENTS, BEST_MODEL, read_settings, the_run
@@ -20,6 +21,7 @@ LOADABLE: dict[str, type[BaseAlgorithm]] = {
     **{name.lower(): getattr(stable_baselines3, name) for name in ("A2C", "DQN", "PPO", "SAC", "TD3")},
     **{name.lower(): getattr(sb3_contrib, name) for name in ("CrossQ", "TQC", "TRPO")},
     **ALGORITHMS,
+    **{cls.__name__.lower(): cls for cls in (VisualSAC, VisualTQC)},
 }
 
 
@@ -56,7 +58,7 @@ def read_data(path: Path) -> dict[str, Any]:
             archive.getinfo("policy.pth")
             if plain.ATTRIBUTE not in data:
                 data["policy_class"], data["observation_space"]
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError) as error:
         raise UserError(f"{path} is corrupt or no .zip at all: {one_line(error)}; use another checkpoint") from error
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, UserError):

@@ -4,6 +4,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_por.common.errors import UserError, check_known, one_line
 from softbody_envs.experts import EXPERT_IDS, has_expert, make_expert
@@ -31,7 +33,7 @@ class RandomModel:
 
 class IdleModel:
     """
-    Policy that does nothing: the middle of every action's range.
+    Policy that does nothing: the middle of every action's range, or what is next to 0 in a range without an end.
 
     :param env_id: a Gymnasium id with a ``Box`` action space
     """
@@ -45,7 +47,9 @@ class IdleModel:
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
         """Return the same action for each observation."""
-        return np.stack([(self.action_space.low + self.action_space.high) / 2 for _ in observation]), state
+        low, high = self.action_space.low, self.action_space.high
+        middle = np.where(self.action_space.bounded_below & self.action_space.bounded_above, (low + high) / 2, 0.0)
+        return np.stack([np.clip(middle, low, high) for _ in observation]), state
 
 
 class ExpertModel:
@@ -85,5 +89,6 @@ def _spaces(env_id: str) -> tuple[gym.Space, Any]:
         env = gym.make(env_id, **kwargs)
     except gym.error.Error as error:
         raise UserError(f"cannot make {env_id}: {one_line(error)}") from error
-    env.close()
-    return env.observation_space, env.action_space
+    seen = BaseAlgorithm._wrap_env(DummyVecEnv([lambda: env]), verbose=0, monitor_wrapper=False)  # images as models see them
+    seen.close()
+    return seen.observation_space, seen.action_space

@@ -221,8 +221,14 @@ def _load_networks(model: BaseAlgorithm, tensors: dict[str, th.Tensor]) -> None:
     if unexpected or not may_lack(model.policy, missing):
         names = sorted(unexpected or missing)
         raise ValueError(f"{len(names)} tensors do not fit a {type(model.policy).__name__}, {names[0]!r:.80} among them")
-    model.policy.load_state_dict({**own, **tensors})
+    targets = {name: tensors[name.replace("critic_target.", "critic.", 1)] for name in missing & _of_target(tensors)}
+    model.policy.load_state_dict({**own, **targets, **tensors})
     vars(model)[LACKS_VALUES] = bool(missing)
+
+
+def _of_target(tensors: dict[str, th.Tensor]) -> set[str]:
+    """Names that the target's copies of a critic's tensors have."""
+    return {name.replace("critic.", "critic_target.", 1) for name in tensors if name.startswith("critic.")}
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import imageio.v2 as imageio
+import numpy as np
 from gymnasium.wrappers import RenderCollection
 from imageio_ffmpeg import count_frames_and_secs
 
@@ -82,10 +83,14 @@ def record_video(
         evaluation = run_episodes(loaded, env, evaluation_episodes(env_id, n_episodes, seed))
         # The vectorised environment resets itself after the last episode: the last frame belongs to the next one.
         frames = env.env_method("render")[0][:-1]
-    except gym.error.Error as error:
+    except (gym.error.Error, NotImplementedError) as error:
         raise UserError(f"{env_id} renders no images: {one_line(error)}") from error
     finally:
         env.close()
+    for frame in frames:
+        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim not in (2, 3):
+            found = f"{frame.dtype} of shape {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
+            raise UserError(f"{env_id} renders no images of uint8: {found}")
     write_video(path, frames, fps)
     return evaluation
 

@@ -4,6 +4,7 @@ import ast
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import partial
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
@@ -193,6 +194,18 @@ def rankers(spec: Any) -> list[str]:
     """
     arguments = [one.get(path) for one in _as_list(spec) if isinstance(one, dict) for path in RANKED_PROGRESS_PATHS]
     return [str(one["ranker"]) for one in arguments if isinstance(one, dict) and "ranker" in one]
+
+
+def with_rankers_by_name(spec: Any) -> list[Any]:
+    """
+    :param spec: Wrappers, see :func:`import_wrappers`
+    :return: The same with the name of each ranker's file instead of its path
+    """
+    return [
+        {path: {**given, "ranker": Path(given["ranker"]).name}} if rankers([one]) else one
+        for one in _as_list(spec)
+        for path, given in (next(iter(one.items())) if isinstance(one, dict) else (one, {}),)
+    ]
 
 
 def _paths(wrapper: Any) -> list[Any]:

@@ -12,17 +12,19 @@ import yaml
 
 from sb3_por.analysis import figures
 from sb3_por.analysis.scores import read_scores
+from sb3_por.common import plain
 from sb3_por.common.errors import UserError
 from sb3_por.evaluation.episodes import EVAL_SEED, Evaluation
 from sb3_por.evaluation.evaluate import evaluate
 from sb3_por.evaluation.loading import find_environment
 from sb3_por.evaluation.plain_files import DATA, STATISTICS
 from sb3_por.evaluation.video import record_video
+from sb3_por.runs import environment
 from sb3_por.runs import folder as files
 from sb3_por.runs.facts import run_identity
-from sb3_por.runs.folder import ARGUMENTS, ENV_KWARGS, HYPERPARAMETERS, read_settings, run_arguments, write_settings
+from sb3_por.runs.folder import ARGUMENTS, ENV_KWARGS, HYPERPARAMETERS, run_arguments, write_settings
 from sb3_por.sharing.agents import agent_name, describe_evaluation
-from sb3_por.sharing.export import load_run, open_run, run_facts
+from sb3_por.sharing.export import load_run, open_run, published_settings, run_facts
 
 #: Files of a card besides the model, by the names that the RL Zoo gives them
 README, RESULTS, VIDEO, CURVE = "README.md", "results.json", "replay.mp4", "curve.png"
@@ -30,6 +32,7 @@ METRICS, PICKLED_STATISTICS = "train_eval_metrics.zip", "vec_normalize.pkl"
 #: Arguments of train.py that name places of the machine
 PLACES = (
     *("conf_file", "log_folder", "tensorboard_log", "trained_agent", "storage", "optimization_log_path", "resume", "demos"),
+    "ranker",
     *("wandb_entity", "wandb_group", "wandb_project_name", "wandb_tags"),
 )
 
@@ -51,12 +54,12 @@ def write_card(run: str | Path, folder: Path, repo: str, n_episodes: int = 10) -
     settings = files.settings_folder(run, env_id)
     model, statistics = load_run(run, env_id)
     name = agent_name(arguments.get("algo", identity["algo"]), env_id)
-    _write_model(run / files.BEST_MODEL, folder / f"{name}.zip", statistics)
+    _write_model(model, run / files.BEST_MODEL, folder / f"{name}.zip", statistics)
     pickled = next((p for p in (settings / files.BEST_STATISTICS, settings / files.STATISTICS) if p.is_file()), None)
     if pickled is not None:
         shutil.copy(pickled, folder / PICKLED_STATISTICS)
     write_settings(folder / ARGUMENTS, {key: value for key, value in arguments.items() if key not in PLACES})
-    hyperparameters = read_settings(settings / HYPERPARAMETERS)
+    hyperparameters = published_settings(run, env_id)
     write_settings(folder / HYPERPARAMETERS, hyperparameters)
     write_settings(folder / ENV_KWARGS, hyperparameters.get("env_kwargs") or {})
     _write_metrics(run, folder / METRICS)
@@ -69,13 +72,18 @@ def write_card(run: str | Path, folder: Path, repo: str, n_episodes: int = 10) -
     return name
 
 
-def _write_model(source: Path, target: Path, statistics: dict[str, Any] | None) -> None:
-    """Copy a model without the place of its logs, and with the plain form of its statistics."""
+def _write_model(model: Any, source: Path, target: Path, statistics: dict[str, Any] | None) -> None:
+    """Copy a model without places of this machine, and with the plain form of its statistics."""
+    instead = {environment.ATTRIBUTE: vars(model)[environment.ATTRIBUTE]}
+    instead |= dict.fromkeys(("tensorboard_log", "demos", "environment_made_of"))
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
         for member in old.namelist():
             content = old.read(member)
             if member == DATA:
-                content = json.dumps(json.loads(content) | {"tensorboard_log": None}, indent=4).encode()
+                data = json.loads(content)
+                data |= {name: value for name, value in instead.items() if name in data}
+                data.get(plain.ATTRIBUTE, {}).get("arguments", {}).pop("demos", None)
+                content = json.dumps(data, indent=4).encode()
             new.writestr(member, content)
         if statistics is not None:
             new.writestr(STATISTICS, json.dumps(statistics))

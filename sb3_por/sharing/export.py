@@ -21,7 +21,7 @@ from sb3_por.evaluation.episodes import EVAL_SEED
 from sb3_por.evaluation.evaluate import evaluate
 from sb3_por.evaluation.loading import find_environment, model_file, resolve
 from sb3_por.evaluation.plain_files import describe_statistics, save_plain
-from sb3_por.runs.environment import TrainingEnvironment
+from sb3_por.runs.environment import TrainingEnvironment, rankers, with_rankers_by_name
 from sb3_por.runs.facts import run_identity
 from sb3_por.runs.folder import COMMAND, HYPERPARAMETERS, last_model, read_settings, run_arguments, settings_folder, the_run
 from sb3_por.runs.provenance import current_machine
@@ -43,7 +43,7 @@ def export_run(run: str | Path, folder: str | Path, n_episodes: int = 50, last: 
     run, folder = open_run(run), Path(folder)
     check_writable(folder)
     identity = run_identity(run)
-    env_id = find_environment(identity["env"], run)
+    env_id = find_environment(identity["env"], run / last_model(identity["env"].rpartition(":")[2]) if last else run)
     model, statistics = load_run(run, env_id, last)
     name = agent_name(identity["algo"], env_id)
     with TemporaryDirectory(dir=folder, prefix=".") as temporary:
@@ -84,14 +84,27 @@ def load_run(run: Path, env_id: str, last: bool = False) -> tuple[Any, dict[str,
     :raises UserError: If there is no such model
     """
     model, environment = resolve(model_file(run / last_model(env_id)) if last else run, env_id)
-    settings = read_settings(settings_folder(run, env_id) / HYPERPARAMETERS)
-    TrainingEnvironment.of_settings(env_id, settings).store_in(model)
+    TrainingEnvironment.of_settings(env_id, published_settings(run, env_id)).store_in(model)
     env = make_evaluation_env(model, env_id, **environment)
     try:
         statistics = unwrap_vec_normalize(env)
         return model, None if statistics is None else describe_statistics(statistics)
     finally:
         env.close()
+
+
+def published_settings(run: Path, env_id: str) -> dict[str, Any]:
+    """
+    :param run: A run's folder
+    :param env_id: Its environment
+    :return: Its hyperparameters, with demonstrations and rankers by their names alone, without folders of this machine
+    """
+    settings = read_settings(settings_folder(run, env_id) / HYPERPARAMETERS)
+    if settings.get("demos"):
+        settings["demos"] = Path(settings["demos"]).name
+    if rankers(settings.get("env_wrapper")):
+        settings["env_wrapper"] = with_rankers_by_name(settings["env_wrapper"])
+    return settings
 
 
 def run_facts(run: Path, env_id: str) -> dict[str, Any]:
@@ -105,7 +118,7 @@ def run_facts(run: Path, env_id: str) -> dict[str, Any]:
     return {
         "seed": arguments.get("seed"),
         "command": without_paths(command.read_text()) if command.is_file() else None,
-        "settings": plain(read_settings(settings_folder(run, env_id) / HYPERPARAMETERS)),
+        "settings": plain(published_settings(run, env_id)),
         "commit": arguments.get("commit"),
         "machine": current_machine(),
         "versions": {

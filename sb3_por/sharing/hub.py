@@ -5,6 +5,7 @@ import re
 import shutil
 import warnings
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -79,8 +80,14 @@ def pull(repo: str, folder: str | Path, env: str | None = None, unsafe: bool = F
         own = files.settings_folder(run, env_id)
         own.mkdir(parents=True)
         shutil.move(fetched / model, run / files.BEST_MODEL)
-        for name in (files.ARGUMENTS, files.HYPERPARAMETERS):
-            if settings := _settings(fetched / name):
+        if not unsafe:  # what it imports is the user's choice
+            package = (env or "").rpartition(":")[0]
+            arguments = {**arguments, "gym_packages": [package] if package else []}
+        for name, settings in (
+            (files.ARGUMENTS, arguments),
+            (files.HYPERPARAMETERS, _settings(fetched / files.HYPERPARAMETERS)),
+        ):
+            if settings:
                 write_settings(own / name, settings)
         for name in filter(names.__contains__, _SHOWN):
             shutil.move(fetched / name, run / name)
@@ -145,7 +152,7 @@ def _take_evaluations(archive: Path, run: Path) -> None:
             small = files.EVALUATIONS in names and metrics.getinfo(files.EVALUATIONS).file_size <= MAX_FILE
             evaluations = metrics.read(files.EVALUATIONS) if small else None
     # Whatever a damaged archive makes zipfile raise
-    except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, OSError, RuntimeError, NotImplementedError, EOFError) as error:
         warnings.warn(f"cannot read {archive.name}, so there are no evaluations to plot: {one_line(error)}", UserNote)
         return
     if evaluations is not None:

@@ -19,6 +19,7 @@ from sb3_por import ALGORITHMS
 from sb3_por.common.errors import UserError, UserNote, check_known, one_line
 from sb3_por.common.files import check_writable
 from sb3_por.evaluation.loading import find_environment, import_packages, model_file, read_data
+from sb3_por.evaluation.safe_loading import is_plain
 from sb3_por.ranking.ranker import Ranker
 from sb3_por.runs.checkpoints import (
     latest_checkpoint,
@@ -34,6 +35,7 @@ from sb3_por.runs.folder import (
     settings_folder,
     the_run,
 )
+from sb3_por.runs.lock import is_locked
 from sb3_por.runs.provenance import current_machine, current_provenance
 from sb3_por.runs.versions import current_commit, differences
 from sb3_por.training.hyperparameters import hyperparameter_file, read_hyperparameters
@@ -139,7 +141,9 @@ class Parser(argparse.ArgumentParser):
         add_ranker_arguments(self)
         self.add_argument("--label", metavar="NAME", help="what tables and figures call the run, instead of its algorithm")
         args = super().parse_args()
-        if args.resume:
+        if args.resume is not None:
+            if not args.resume:
+                self.error("--resume needs the name of a run's folder")
             return self._resumed(Path(args.resume))
         self._check(args)
         if args.trial_id is not None and not (args.storage and args.study_name):
@@ -152,8 +156,13 @@ class Parser(argparse.ArgumentParser):
         import_packages(args.gym_packages)
         args.env = find_environment(args.env)
         if args.trained_agent:
-            args.trained_agent = str(model_file(args.trained_agent))
-            _check_kept(args.algo, args.hyperparams, read_data(Path(args.trained_agent)))
+            args.trained_agent = str(model_file(args.trained_agent).resolve())  # resumed from any folder
+            data = read_data(Path(args.trained_agent))
+            if is_plain(data):
+                raise UserError(
+                    f"{args.trained_agent} only plays: an exported agent holds no Q networks; give its run's model"
+                )
+            _check_kept(args.algo, args.hyperparams, data)
         args.conf_file = args.conf_file or str(hyperparameter_file(args.algo, args.env, bool(args.demos)))
         if args.conf_file.endswith((".yml", ".yaml")):
             read_hyperparameters(args.conf_file, args.env)  # refuses what the zoo takes apart without a look
@@ -192,12 +201,20 @@ class Parser(argparse.ArgumentParser):
         saved = import_names(run_arguments(run))
         if "env" not in saved:
             raise UserError(f"{run} is not the folder of a run: no */{ARGUMENTS} in it; give <log-folder>/<algo>/<env>_<n>")
+        began_with = saved.pop("trained_agent", "")
         self.set_defaults(**{**saved, "progress": sys.stderr.isatty()})
         args = super().parse_args()
         args.resume = str(run)
+        if args.trained_agent:
+            raise UserError("--resume continues a run with its own model; leave out -i")
+        if latest_checkpoint(run) is None and not (run / last_model(saved["env"])).is_file():
+            args.trained_agent = began_with  # it had not come far enough for a model of its own
+            if began_with and not Path(began_with).is_file():
+                raise UserError(f"{run} has no checkpoint yet, and {began_with}, which it began with, is gone")
         for name in ("algo", "env"):
             if getattr(args, name).rpartition(":")[2] != saved.get(name):
                 raise UserError(f"--resume continues {saved.get('algo')} on {saved['env']}; leave out --{name}")
+        args.env = saved["env"]
         if args.seed != saved.get("seed", args.seed):
             raise UserError(f"--resume continues a run of seed {saved['seed']}; leave out --seed")
         settings = read_settings(settings_folder(run, saved["env"]) / HYPERPARAMETERS)
@@ -207,7 +224,8 @@ class Parser(argparse.ArgumentParser):
         self._check(args)
         last = run / last_model(saved["env"])
         if last.exists() and latest_checkpoint(run) is None:
-            remove_checkpoints(run)  # remains of them, if the run was killed while it removed them
+            if not is_locked(run):
+                remove_checkpoints(run)  # remains of them, if the run was killed while it removed them
             done = read_data(last)["num_timesteps"]
             if args.n_timesteps <= done:
                 print(f"{run} is finished: nothing to do. Pass -n with more than its {done} steps to extend it.")

@@ -58,8 +58,10 @@ def check_zoo_settings(settings: dict[str, Any]) -> None:
     :param settings: Hyperparameters
     :raises UserError: If one cannot be used
     """
-    for name in ("n_envs", "frame_stack"):
+    for name in ("n_envs", "frame_stack", "n_timesteps"):
         value = settings.get(name, 1)
+        if name == "n_timesteps" and isinstance(value, float) and value.is_integer():
+            value = int(value)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise UserError(f"{name} must be a whole number of at least 1, got {value!r}")
     unit = settings["train_freq"][-1:] if isinstance(settings.get("train_freq"), (tuple, list)) else ()

@@ -1,5 +1,6 @@
 """One run of train.py: the RL Zoo's ExperimentManager with evaluation, checkpoints and messages of ours."""
 
+import glob
 import os
 import shlex
 import shutil
@@ -44,6 +45,7 @@ from sb3_por.runs.checkpoints import (
 from sb3_por.runs.environment import TrainingEnvironment, read_normalization, with_ranker
 from sb3_por.runs.folder import (
     ARGUMENTS,
+    BEST_MODEL,
     BEST_STATISTICS,
     COMMAND,
     EVALUATIONS,
@@ -55,6 +57,7 @@ from sb3_por.runs.folder import (
     last_model,
     read_evaluations,
     read_settings,
+    run_arguments,
     write_settings,
 )
 from sb3_por.common.checks import check_types
@@ -90,6 +93,9 @@ class Experiment(ExperimentManager):
         if start is not None:
             self.trained_agent = str(start)
             self.continue_training = True
+        recorded = run_arguments(self._resumed_run) if self._resumed_run else {}
+        #: Whether another number of steps was given than the run had
+        self._new_length = bool(recorded) and self.args.n_timesteps not in (-1, recorded.get("n_timesteps"))
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -126,7 +132,7 @@ class Experiment(ExperimentManager):
         if self.trained_agent:
             note_foreign(Path(self.trained_agent))  # before anything in its folder is unpickled
         while self._resumed_run is None:
-            run_id = get_latest_run_id(self.log_path, self.env_name) + 1
+            run_id = get_latest_run_id(glob.escape(self.log_path), self.env_name) + 1
             self.save_path = os.path.join(self.log_path, f"{self.env_name}_{run_id}{self._uuid}")
             try:
                 os.makedirs(self.save_path, exist_ok=False)
@@ -136,7 +142,7 @@ class Experiment(ExperimentManager):
         if self._resumed_run is not None:
             self.save_path = str(self._resumed_run)
             # Monitor begins its file anew by default.
-            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": not self.continue_training}
+            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": self._checkpoint is None and not self._extends}
         self.params_path = os.path.join(self.save_path, self.env_name)
         os.makedirs(self.params_path, exist_ok=True)
         self._folder_made = self._resumed_run is None
@@ -157,6 +163,8 @@ class Experiment(ExperimentManager):
         """
         try:
             experiment = super().setup_experiment()
+            if experiment is not None:
+                self._check_evaluation(experiment[0])
             if experiment is not None and self._resumed_run is None:
                 self._load_demos(experiment[0])
         except Exception as error:  # of any package, user's module or setting
@@ -172,6 +180,16 @@ class Experiment(ExperimentManager):
             setattr(model, plain.ATTRIBUTE, plain.describe(model))
         return experiment
 
+    def _check_evaluation(self, model: BaseAlgorithm) -> None:
+        """
+        :raises UserError: If evaluation observes something else than training
+        """
+        for callback in self.callbacks:
+            if isinstance(callback, EvaluationCallback):
+                seen = BaseAlgorithm._wrap_env(callback.eval_env, verbose=0, monitor_wrapper=False).observation_space
+                if seen != model.observation_space:
+                    raise UserError(f"--eval-env-kwargs: evaluation observes {seen}, and training {model.observation_space}")
+
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
         Evaluation plays the same episodes each time; the zoo's begin as the training environment does.
@@ -185,6 +203,21 @@ class Experiment(ExperimentManager):
             self.env_wrapper = inner
         if eval_env:
             self._deal_out(env)
+        return self._normalized(env, eval_env)
+
+    def _normalized(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        """The best model has statistics of its own; the zoo takes those of the run's end, or new ones in silence."""
+        started = Path(self.trained_agent) if self.trained_agent and self._resumed_run is None else None
+        if started is not None:
+            folder = started.parent / str(self.env_name)
+            best = folder / BEST_STATISTICS
+            if started.name == BEST_MODEL and best.is_file():
+                normalized = VecNormalize.load(str(best), env)
+                if eval_env:
+                    normalized.training = normalized.norm_reward = False
+                return normalized
+            if self.normalize and not eval_env and not (folder / STATISTICS).is_file():
+                warnings.warn(f"there are no statistics of observations in {folder}: normalization begins anew", UserNote)
         return super()._maybe_normalize(env, eval_env)
 
     def _deal_out(self, env: VecEnv) -> None:
@@ -207,6 +240,7 @@ class Experiment(ExperimentManager):
 
     def hyperparameters_optimization(self) -> None:
         """Report in one line why a search has failed, and leave no run's folder behind."""
+        handler = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
         try:
             super().hyperparameters_optimization()
         except Exception as error:  # of any database's driver, sampler or trial
@@ -214,6 +248,7 @@ class Experiment(ExperimentManager):
                 raise
             raise UserError(f"the search of {self.algo} has failed: {one_line(error)} (--verbose 2 shows where)") from error
         finally:
+            signal.signal(signal.SIGTERM, handler)
             if self._folder_made:
                 shutil.rmtree(self.save_path, ignore_errors=True)
 
@@ -312,7 +347,8 @@ class Experiment(ExperimentManager):
             kwargs["log_interval"] = self.log_interval if self.log_interval > 0 else None
         n_timesteps = self.n_timesteps
         if self._checkpoint or self._extends:  # the total
-            n_timesteps = max(n_timesteps, model._total_timesteps) - model.num_timesteps
+            total = n_timesteps if self._new_length else max(n_timesteps, model._total_timesteps)
+            n_timesteps = max(total - model.num_timesteps, 0)
         handlers = {number: signal.signal(number, self._request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             model.learn(n_timesteps, **kwargs)

@@ -62,7 +62,10 @@ class WorkerProcesses(SubprocVecEnv):
     """
 
     def __init__(self, env_fns: list[Callable[[], gym.Env]]) -> None:
-        super().__init__([partial(_undisturbed, make) for make in env_fns])
+        try:
+            super().__init__([partial(_undisturbed, make) for make in env_fns])
+        except (ConnectionError, EOFError) as error:
+            raise UserError("an environment process ended while it made its environment; its error is above") from error
         self.remotes: Any = tuple(_Pipe(remote, self._describe_lost) for remote in self.remotes)
         self._has_lost = False
         # Before multiprocessing's own exit, which sends SIGTERM and waits.

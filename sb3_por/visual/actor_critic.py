@@ -198,6 +198,9 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         self.actor.optimizer.step()
         self._metrics.add("actor_loss", actor_loss)
         self._metrics.add("entropy", -log_prob.mean())
+        # The last distribution would keep this update's graph, and a policy with a graph cannot be copied
+        for name in vars(self.actor.action_dist).keys() & {"distribution", "gaussian_actions"}:
+            setattr(self.actor.action_dist, name, None)
 
         if self.ent_coef_optimizer is not None:
             ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()

@@ -114,13 +114,14 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         if self.replay_buffer_class is None:
             self.replay_buffer_class = SequenceReplayBuffer
         own_buffer = issubclass(self.replay_buffer_class, SequenceReplayBuffer)
-        if own_buffer:
-            self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs, n_steps=self.n_steps, gamma=self.gamma)
+        given = self.replay_buffer_kwargs
+        self.replay_buffer_kwargs = self._buffer_arguments()
         with warnings.catch_warnings():
             if own_buffer:
                 # SB3 knows its own buffers only
                 warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
+        self.replay_buffer_kwargs = given  # what is saved, and perhaps loaded with another kind of buffer
         if own_buffer:
             # If set, SB3 would end the episode that a second learn() cuts off
             self.optimize_memory_usage = False
@@ -132,6 +133,11 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         self._metrics = RunningMeans()
         # In the .zip, from which a stranger rebuilds the model without pickled code
         setattr(self, plain.ATTRIBUTE, plain.describe(self))
+
+    def _buffer_arguments(self) -> dict[str, Any]:
+        """The replay buffer's arguments; our own computes the returns, too."""
+        own = issubclass(self.replay_buffer_class, SequenceReplayBuffer)
+        return self.replay_buffer_kwargs | ({"n_steps": self.n_steps, "gamma": self.gamma} if own else {})
 
     def _check_arguments(self) -> None:
         """
@@ -219,6 +225,8 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         :param progress_bar: Show a progress bar
         :return: The model
         """
+        if vars(self).get("lacks_values"):
+            raise UserError("an exported agent only plays: it holds no Q networks; to train on, take the model of its run")
         self.environment_made_of = made_of(self.env)
         name = type(self).__name__ if tb_log_name is None else tb_log_name
         if self.demos is not None and self.demo_buffer is None:
@@ -238,12 +246,15 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         :param other: Model with an encoder of the same shape
         :raises ValueError: If the encoder has another shape
         """
-        try:
-            for critic in (self.critic, self.critic_target):
-                critic.features_extractor.load_state_dict(other.critic.features_extractor.state_dict())
-                critic.projection.load_state_dict(other.critic.projection.state_dict())
-        except RuntimeError as error:
-            raise ValueError(f"the encoder of {type(other).__name__} has another shape: {error}") from error
+        own, given = ((one.critic.features_extractor, one.critic.projection) for one in (self, other))
+        for mine, theirs in zip(own, given, strict=True):
+            if str(mine) != str(theirs):  # layers with their shapes and strides
+                raise ValueError(f"the encoder of {type(other).__name__} has another shape: {theirs} instead of {mine}")
+        if self.policy.normalize_images != other.policy.normalize_images:
+            raise ValueError(f"the encoder of {type(other).__name__} sees images in another range (normalize_images)")
+        for critic in (self.critic, self.critic_target):
+            critic.features_extractor.load_state_dict(given[0].state_dict())
+            critic.projection.load_state_dict(given[1].state_dict())
 
     def load_demos(self, path: str | pathlib.Path) -> None:
         """
@@ -264,7 +275,7 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
             device=self.device,
             n_envs=1,
             optimize_memory_usage=self.optimize_memory_usage,
-            **self.replay_buffer_kwargs,
+            **self._buffer_arguments(),
         )
         fill(buffer, demonstrations)
         self._compare_environments(demonstrations.spec)

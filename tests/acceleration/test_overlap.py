@@ -76,6 +76,13 @@ def test_overlapped_runs_are_reproducible(cls):
     assert th.equal(*parameters)
 
 
+def test_each_environment_keeps_a_noise_of_its_own():
+    model = make_model(make_env(n_envs=3), use_sde=True, overlap=True, train_freq=4, learning_starts=0)
+    seen = []
+    model.learn(48, lambda local_variables, _: seen.append(len(model.actor.action_dist.exploration_matrices)) or True)
+    assert set(seen) == {3}
+
+
 def test_train_called_directly_trains_at_once():
     model = make_model(make_env(), overlap=True).learn(20)
     n_updates = model._n_updates

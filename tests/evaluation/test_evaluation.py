@@ -14,12 +14,15 @@ from sb3_contrib.common.wrappers import TimeFeatureWrapper
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from toy_envs import DotEnv
 
+from sb3_por import VisualSAC, VisualTQC
 from sb3_por.common.errors import UserError, UserNote
 from sb3_por.evaluation.episodes import Episode, Evaluation, FixedEpisodes, evaluation_episodes, run_episodes
 from sb3_por.evaluation.evaluate import evaluate
 from sb3_por.evaluation.loading import load_model, trained_in
-from sb3_por.evaluation.reference_policies import ExpertModel, RandomModel
+from sb3_por.evaluation.reference_policies import ExpertModel, IdleModel, RandomModel
+from sb3_por.evaluation.safe_loading import load_safe
 from sb3_por.evaluation.video import record_video, write_video
 from softbody_envs.wrappers import ActionRepeat
 
@@ -157,6 +160,75 @@ def test_expert_is_the_ceiling_and_random_the_floor():
     assert expert.successes == [1.0]
 
 
+@pytest.fixture
+def dots(monkeypatch):
+    """Ids of environments with images, channels last, alone and beside a vector."""
+    ids = []
+    for obs_type in ("pixels", "dict"):
+        gym.register(f"Dots-{obs_type}-v0", DotEnv, kwargs={"size": 20, "obs_type": obs_type})
+        ids.append(f"Dots-{obs_type}-v0")
+    yield ids
+    for name in ids:
+        gym.registry.pop(name)
+
+
+@pytest.mark.parametrize("policy", [RandomModel, IdleModel])
+def test_reference_policies_play_environments_with_images(policy, dots):
+    for name in dots:
+        assert evaluate(policy(name), name, 1).lengths == [20]
+
+
+def test_doing_nothing_in_a_range_without_an_end_is_0():
+    class Unbounded(DotEnv):
+        def __init__(self):
+            super().__init__(size=20, obs_type="state")
+            self.action_space = spaces.Box(np.array([-np.inf, 1.0, -1.0]), np.array([np.inf, np.inf, 3.0]), dtype=np.float64)
+
+    gym.register("Unbounded-v0", Unbounded)
+    try:
+        assert IdleModel("Unbounded-v0").predict(np.zeros((1, 2)))[0].tolist() == [[0.0, 1.0, 1.0]]
+    finally:
+        gym.registry.pop("Unbounded-v0")
+
+
+@pytest.mark.parametrize("frame", ["raises", None, np.zeros((8, 8, 3))])
+def test_an_environment_that_renders_no_images_is_named(frame, tmp_path):
+    class Blind(DotEnv):
+        metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+        def __init__(self, render_mode=None):
+            super().__init__(size=20, obs_type="state")
+            self.render_mode = render_mode
+
+        def render(self):
+            if isinstance(frame, str):
+                raise NotImplementedError
+            return frame
+
+    gym.register("Blind-v0", Blind)
+    try:
+        with pytest.raises(UserError, match="Blind-v0 renders no images"):
+            record_video(RandomModel("Blind-v0"), "Blind-v0", tmp_path / "video.gif")
+    finally:
+        gym.registry.pop("Blind-v0")
+
+
+def test_models_without_an_objective_are_loaded_by_their_class(tmp_path):
+    for cls in (VisualSAC, VisualTQC):
+        model = cls("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs=dict(net_arch=[8]))
+        model.save(tmp_path / "model.zip")
+        for load in (load_model, load_safe):
+            loaded = load(tmp_path / "model.zip")
+            assert all(map(th.equal, loaded.policy.state_dict().values(), model.policy.state_dict().values()))
+        assert type(loaded) is cls
+
+
+def test_damaged_statistics_are_one_line(tmp_path, pendulum_model):
+    (tmp_path / "statistics.pkl").write_bytes(b"no pickle")
+    with pytest.raises(UserError, match="cannot read the statistics of observations"):
+        evaluate(pendulum_model, "Pendulum-v1", 1, vec_normalize=str(tmp_path / "statistics.pkl"))
+
+
 def test_models_that_have_diverged_and_actions_that_are_not_finite_are_refused():
     model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=10)
     with th.no_grad():
@@ -215,6 +287,11 @@ def test_files_that_are_no_models_are_refused(pendulum_zip, tmp_path):
         archive.writestr("a.txt", "hello")
     with zipfile.ZipFile(tmp_path / "list.zip", "w") as archive:
         archive.writestr("data", "[]")
+    with zipfile.ZipFile(tmp_path / "deflated.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("data", json.dumps(list(range(5000))))
+    deflated = bytearray((tmp_path / "deflated.zip").read_bytes())
+    deflated[40:60] = b"\xff" * 20  # what zlib itself refuses
+    (tmp_path / "deflated.zip").write_bytes(bytes(deflated))
     for name, message in {
         "missing": "there is no model",
         "text": "corrupt",
@@ -222,6 +299,7 @@ def test_files_that_are_no_models_are_refused(pendulum_zip, tmp_path):
         "flipped": "corrupt",
         "foreign": "not saved by Stable-Baselines3",
         "list": "not saved by Stable-Baselines3",
+        "deflated": "corrupt",
     }.items():
         with pytest.raises(UserError, match=message) as error:
             load_model(tmp_path / f"{name}.zip")

@@ -109,6 +109,11 @@ def test_a_plain_file_goes_without_what_only_learning_needs(cls, tmp_path):
     fresh.load_encoder(loaded)  # what it learned to see can be used
     encoders = (one.critic.features_extractor.state_dict() for one in (fresh, model))
     assert all(th.equal(a, b) for a, b in zip(*(encoder.values() for encoder in encoders), strict=True))
+    target, own = (one.features_extractor.state_dict().values() for one in (loaded.critic_target, loaded.critic))
+    assert all(map(th.equal, target, own))
+    loaded.set_env(DotEnv(size=32))
+    with pytest.raises(UserError, match="an exported agent only plays"):
+        loaded.learn(10)
 
 
 @pytest.mark.parametrize("which", ["por_zip", "sac_zip"])

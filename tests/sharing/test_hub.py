@@ -4,6 +4,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import zipfile
 
 import pytest
@@ -14,7 +15,10 @@ from stable_baselines3 import SAC
 from sb3_por.__main__ import main
 from sb3_por.common.errors import UserError, UserNote
 from sb3_por.evaluation import evaluate
-from sb3_por.runs.folder import read_settings
+from sb3_por.runs.environment import RANKED_PROGRESS, TrainingEnvironment
+from sb3_por.runs.folder import read_settings, write_settings
+from sb3_por.sharing.card import write_card
+from sb3_por.sharing.export import export_run
 from sb3_por.sharing.hub import MAX_FILE, _take_evaluations, pull, push
 from sb3_por.training.zoo import main as train
 
@@ -86,6 +90,43 @@ def test_no_folder_of_the_machine_is_published(run, pushed):
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 texts = [archive.read(member) for member in archive.namelist()]
         assert not any(str(run.parents[1]).encode() in text for text in texts), name
+
+
+def test_demonstrations_and_rankers_are_published_by_their_names(run, tmp_path):
+    copied = shutil.copytree(run, tmp_path / "logs" / "sac" / "Pendulum-v1_1")
+    settings = {**read_settings(copied / "Pendulum-v1" / "config.yml"), "demos": "/home/me/shown"}
+    settings["env_wrapper"] = [{RANKED_PROGRESS: {"ranker": "/home/me/fold.npz", "scale": 5.0}}]
+    write_settings(copied / "Pendulum-v1" / "config.yml", settings)
+    arguments = read_settings(copied / "Pendulum-v1" / "args.yml")
+    write_settings(
+        copied / "Pendulum-v1" / "args.yml", {**arguments, "demos": "/home/me/shown", "ranker": "/home/me/fold.npz"}
+    )
+    model = SAC.load(copied / "best_model.zip")
+    model.demos = "/home/me/shown"
+    TrainingEnvironment.of_settings("Pendulum-v1", settings).store_in(model)
+    model.save(copied / "best_model.zip")
+    (tmp_path / "card").mkdir()
+    write_card(copied, tmp_path / "card", REPO, n_episodes=1)
+    export_run(copied, tmp_path / "agents", n_episodes=1)
+    for file in [*(tmp_path / "card").iterdir(), *(tmp_path / "agents").iterdir()]:
+        texts = [file.read_bytes()]
+        if file.suffix == ".zip":
+            with zipfile.ZipFile(file) as archive:
+                texts = [archive.read(member) for member in archive.namelist()]
+        assert not any(b"/home/me" in text for text in texts), file.name
+    published = read_settings(tmp_path / "card" / "config.yml")
+    assert published["demos"] == "shown" and published["env_wrapper"] == [
+        {RANKED_PROGRESS: {"ranker": "fold.npz", "scale": 5.0}}
+    ]
+
+
+def test_the_packages_that_a_repository_names_are_not_imported_later(hub, pushed, tmp_path):
+    arguments = {**yaml.safe_load(pushed[0]["args.yml"]), "gym_packages": ["stranger"]}
+    hub.files[REPO] = {**pushed[0], "args.yml": yaml.safe_dump(arguments).encode()}
+    pull(REPO, tmp_path / "pulled")
+    assert evaluate(tmp_path / "pulled", "Pendulum-v1", 1).lengths == [200]
+    pull(REPO, tmp_path / "of_mine", env="toy_envs:Pendulum-v1")
+    assert read_settings(tmp_path / "of_mine" / "Pendulum-v1" / "args.yml")["gym_packages"] == ["toy_envs"]
 
 
 def test_the_pushed_model_is_one_of_sb3(pushed, tmp_path):

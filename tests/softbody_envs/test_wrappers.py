@@ -50,6 +50,9 @@ def test_wrong_actions_are_refused_as_without_it():
     env.reset(seed=0)
     with pytest.raises(ValueError, match="nan"):
         env.step(np.array([np.nan, 0.0, 0.0], dtype=np.float32))
+    for action in (0.5, [0.5]):  # which numpy would repeat for each element
+        with pytest.raises(ValueError, match="shape"):
+            env.step(action)
 
 
 @pytest.mark.parametrize("arguments", [dict(repeat=0), dict(repeat=1.5), dict(repeat=2, scale=0.0), dict(repeat=2, scale=2.0)])
@@ -150,8 +153,13 @@ def test_a_swing_comes_back_and_a_drift_moves_on():
 def test_wrong_distractions_are_refused(arguments):
     with pytest.raises(ValueError, match=list(arguments)[-1]):
         Distraction(gym.make(ID, image_size=40), **arguments)
-    with pytest.raises(ValueError, match="observes images"):
-        Distraction(gym.make(ID, obs_type="state"), motion="swing")
+    images = gym.make(ID, image_size=40)
+    grey = gym.wrappers.GrayscaleObservation(images, keep_dim=True)
+    oblong = gym.wrappers.ResizeObservation(images, (40, 60))
+    floats = gym.wrappers.TransformObservation(images, lambda o: o / 255, gym.spaces.Box(0.0, 1.0, (40, 40, 3), np.float32))
+    for env in (gym.make(ID, obs_type="state"), grey, oblong, floats):
+        with pytest.raises(ValueError, match="square RGB images of uint8"):
+            Distraction(env, motion="swing")
 
 
 def test_an_episode_does_not_inherit_the_performance_of_the_last_one():

@@ -325,6 +325,54 @@ def test_resume_of_what_is_finished_no_run_or_in_use_is_said(tmp_path, capsys):
     assert (run / "Pendulum-v1" / "args.yml").exists()
 
 
+def test_a_run_that_began_with_a_model_is_resumed_without_that_model(tmp_path, capsys, monkeypatch):
+    brief = ["--eval-freq", "-1", "--save-freq", "20"]
+    assert main([*FLAGS, *brief, "-n", "30", "-f", str(tmp_path / "first"), *SMALL]) == 0
+    start = tmp_path / "first" / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip"
+
+    def die(callback):
+        if callback.num_timesteps == 55:
+            raise RuntimeError("killed")
+        return True
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_por.training.experiment.CheckpointCallback._on_step", die)
+        with pytest.raises(RuntimeError, match="killed"):
+            main([*FLAGS, *brief, "-n", "100", "-i", str(start), "-f", str(tmp_path / "second"), *SMALL])
+    run = tmp_path / "second" / "sac" / "Pendulum-v1_1"
+    assert main(["--resume", str(run), "-i", str(start)]) == 2
+    assert "--resume continues a run with its own model; leave out -i" in capsys.readouterr().err
+    start.unlink()
+    assert main(["--resume", str(run), "-n", "60"]) == 0  # fewer than it was to have
+    assert load_model(run / "Pendulum-v1.zip").num_timesteps == 60
+    lengths = [int(row.split(",")[1]) for row in (run / "0.monitor.csv").read_text().splitlines()[2:]]
+    assert sum(lengths) <= 60
+
+    shutil.rmtree(run / "checkpoint", ignore_errors=True)
+    (run / "Pendulum-v1.zip").unlink()
+    arguments = yaml.safe_load((run / "Pendulum-v1" / "args.yml").read_text()) | {"trained_agent": str(start)}
+    (run / "Pendulum-v1" / "args.yml").write_text(yaml.safe_dump(arguments))
+    assert main(["--resume", str(run)]) == 2
+    assert f"has no checkpoint yet, and {start}, which it began with, is gone" in capsys.readouterr().err
+    assert main(["--resume", ""]) == 2
+    assert "--resume needs the name of a run's folder" in capsys.readouterr().err
+
+
+def test_checkpoints_of_a_process_at_work_are_left_alone(tmp_path, monkeypatch):
+    assert main([*FLAGS, "-n", "20", "--eval-freq", "-1", "-f", str(tmp_path), *SMALL]) == 0
+    run = tmp_path / "sac" / "Pendulum-v1_1"
+    written = run / "checkpoint" / ".new"
+    written.mkdir(parents=True)
+    monkeypatch.setattr("sb3_por.training.arguments.is_locked", lambda folder: folder == run)
+    with pytest.raises(SystemExit):
+        main(["--resume", str(run)])
+    assert written.exists()
+    monkeypatch.undo()
+    with pytest.raises(SystemExit):
+        main(["--resume", str(run)])
+    assert not written.exists()
+
+
 @pytest.mark.parametrize("keeps_buffer", [True, False])
 def test_a_finished_run_is_extended_in_its_folder(keeps_buffer, tmp_path, capsys, monkeypatch):
     flags = ["-n", "60", "--eval-freq", "60", "--eval-episodes", "1", "-f", str(tmp_path)]

@@ -1,5 +1,6 @@
 """What does not belong to a model is refused where it is loaded; an encoder can be taken from another method."""
 
+import copy
 import re
 
 import numpy as np
@@ -61,8 +62,28 @@ def test_a_method_can_start_from_the_encoder_of_another():
     other = make_model(
         VisualSAC, policy_kwargs=dict(net_arch=[8], features_extractor_kwargs=dict(n_filters=8, strides=(2, 2)))
     )
-    with pytest.raises(ValueError, match="has another shape"):
-        other.load_encoder(por)
+    centered = make_model(
+        VisualSAC,
+        policy_kwargs=dict(net_arch=[8], features_extractor_kwargs=dict(**POLICY["features_extractor_kwargs"], center=True)),
+    )
+    for one in (other, centered):
+        before = [parameter.clone() for parameter in one.critic.parameters()]
+        with pytest.raises(ValueError, match="has another shape"):
+            one.load_encoder(por)
+        assert all(map(th.equal, before, one.critic.parameters()))
+
+
+def test_a_model_is_loaded_with_another_kind_of_buffer(tmp_path):
+    make_model(SACDrQ, n_steps=3).save(tmp_path / "model.zip")
+    model = SACDrQ.load(tmp_path / "model.zip", env=DotEnv(size=20), replay_buffer_class=ReplayBuffer, n_steps=1)
+    assert type(model.replay_buffer) is ReplayBuffer
+    assert SACDrQ.load(tmp_path / "model.zip", env=DotEnv(size=20)).replay_buffer.n_steps == 3
+
+
+def test_a_trained_policy_can_be_copied():
+    model = make_model(SACPOR).learn(40)
+    copied = copy.deepcopy(model.policy)
+    assert all(map(th.equal, copied.state_dict().values(), model.policy.state_dict().values()))
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,11 @@ ATTRIBUTE = "plain_description"
 #: Arguments of an algorithm that have no place in a description: they concern learning, memory or the machine
 LEFT_OUT = (
     *("policy", "env", "policy_kwargs", "device", "_init_setup_model", "seed", "verbose", "tensorboard_log"),
-    *("buffer_size", "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage", "demos"),
+    *("buffer_size", "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage"),
     *("rollout_buffer_class", "rollout_buffer_kwargs", "action_noise", "train_freq", "overlap", "precision", "compile_mode"),
 )
+#: Arguments of an algorithm that name places of the machine: a description has None for them
+PLACES = ("demos",)
 #: Arguments of a policy that have no place in a description: an algorithm gives them, or only learning needs them
 POLICY_LEFT_OUT = ("objective_class", "objective_kwargs", "optimizer_class", "optimizer_kwargs")
 #: Most values of one array in a space
@@ -36,11 +38,12 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
     """
     aliases = [name for name, policy in model.policy_aliases.items() if policy is model.policy_class]
     policy_kwargs = {name: value for name, value in (model.policy_kwargs or {}).items() if name not in POLICY_LEFT_OUT}
+    values = {name: None if name in PLACES else value for name, value in vars(model).items()}
     return {
         "algorithm": type(model).__name__,
         "policy": aliases[0] if aliases else class_path(model.policy_class),
         "policy_kwargs": plain(policy_kwargs),
-        "arguments": arguments(type(model), vars(model)),
+        "arguments": arguments(type(model), values),
         "observation_space": describe_space(model.observation_space),
         "action_space": describe_space(model.action_space),
     }

@@ -75,14 +75,15 @@ def write_card(run: str | Path, folder: Path, repo: str, n_episodes: int = 10) -
 def _write_model(model: Any, source: Path, target: Path, statistics: dict[str, Any] | None) -> None:
     """Copy a model without places of this machine, and with the plain form of its statistics."""
     instead = {environment.ATTRIBUTE: vars(model)[environment.ATTRIBUTE]}
-    instead |= dict.fromkeys(("tensorboard_log", "demos", "environment_made_of"))
+    instead |= dict.fromkeys(("tensorboard_log", "environment_made_of", *plain.PLACES))
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
         for member in old.namelist():
             content = old.read(member)
             if member == DATA:
                 data = json.loads(content)
                 data |= {name: value for name, value in instead.items() if name in data}
-                data.get(plain.ATTRIBUTE, {}).get("arguments", {}).pop("demos", None)
+                described = data.get(plain.ATTRIBUTE, {}).get("arguments", {})
+                described |= dict.fromkeys(described.keys() & set(plain.PLACES))
                 content = json.dumps(data, indent=4).encode()
             new.writestr(member, content)
         if statistics is not None:

@@ -1,6 +1,7 @@
 """A Bullet world: client, settings and floor."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import pybullet
 
@@ -34,6 +35,9 @@ class World:
     :param deformable: whether the world can hold cloth; rigid worlds are faster
     """
 
+    #: Bullet's contact threshold, one variable for all worlds of the process, as a world has set it last.
+    _threshold_in_use: ClassVar[float | None] = None
+
     def __init__(self, steps_per_control: int, deformable: bool = False) -> None:
         self.steps_per_control = steps_per_control
         self.time_step = CONTROL_PERIOD / steps_per_control
@@ -49,6 +53,7 @@ class World:
         self.client.resetSimulation(pybullet.RESET_USE_DEFORMABLE_WORLD if self.deformable else 0)
         self.floor = None
         self.contact_breaking_threshold = CONTACT_BREAKING_THRESHOLD
+        World._threshold_in_use = None
         self.client.setGravity(0.0, 0.0, GRAVITY)
         # File caching would serve an old mesh under a reused name (bullet#2277).
         self.client.setPhysicsEngineParameter(
@@ -57,8 +62,9 @@ class World:
 
     def step(self) -> None:
         """Advance by ``time_step`` seconds."""
-        # One variable for the whole process, which another world may have set
-        self.client.setPhysicsEngineParameter(contactBreakingThreshold=self.contact_breaking_threshold)
+        if World._threshold_in_use != self.contact_breaking_threshold:
+            self.client.setPhysicsEngineParameter(contactBreakingThreshold=self.contact_breaking_threshold)
+            World._threshold_in_use = self.contact_breaking_threshold
         self.client.stepSimulation()
 
     def close(self) -> None:

@@ -471,6 +471,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "progress": lambda: evaluations("progress"),
     "pour": lambda: evaluations("pour"),
     "figure4_pour": lambda: evaluations("figure4_pour"),
+    "drop": lambda: evaluations("drop"),
     "demos": lambda: evaluations("demos"),
     "rope": lambda: evaluations("rope"),
     "sparse": lambda: evaluations("sparse"),

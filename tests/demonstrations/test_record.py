@@ -66,7 +66,7 @@ def test_record_from_the_shell(tmp_path, capsys):
     flags = ["--model", "expert", "--env", "StraightenRope-v0", "-n", "1", "-o", str(path)]
     assert main(["record", *flags, "--algo", "sac_drq", "--env-kwargs", "obs_type:dict", "image_size:32"]) == 0
     line, where = capsys.readouterr().out.splitlines()
-    assert "success 100%" in line and "length 15 (1 episode)" in line and where == str(path)
+    assert "success 100%" in line and "length 38 (1 episode)" in line and where == str(path)
     (episode,) = Demonstrations(path).episodes()
     assert episode.observations["image"].shape == (16, 32, 32, 3) and episode.observations["state"].shape[0] == 16
     assert main(["record", *flags]) == 2

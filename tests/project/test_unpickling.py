@@ -30,6 +30,7 @@ TOLD = {
     ("sb3_por/evaluation/environment.py", "_normalize", "load"): "statistics of the same model",
     # -- train.py --resume and -i: after note_foreign
     ("sb3_por/training/experiment.py", "_load_pretrained_agent", "_load_pretrained_agent"): "the model that the user resumes",
+    ("sb3_por/training/experiment.py", "_normalized", "load"): "statistics of the best model that the user begins with",
     ("sb3_por/runs/checkpoints.py", "restore_buffer", "pickle.loads"): "its replay buffer",
     ("sb3_por/runs/checkpoints.py", "read_rng_state", "pickle.loads"): "its random states",
     ("sb3_por/visual/algorithm.py", "load_replay_buffer", "load_replay_buffer"): "SB3's method, extended",

@@ -68,7 +68,7 @@ def test_record_from_the_shell(tmp_path, capsys):
     line, where = capsys.readouterr().out.splitlines()
     assert "success 100%" in line and "length 38 (1 episode)" in line and where == str(path)
     (episode,) = Demonstrations(path).episodes()
-    assert episode.observations["image"].shape == (16, 32, 32, 3) and episode.observations["state"].shape[0] == 16
+    assert episode.observations["image"].shape == (39, 32, 32, 3) and episode.observations["state"].shape[0] == 39
     assert main(["record", *flags]) == 2
     assert "exists; give a new folder" in capsys.readouterr().err
 

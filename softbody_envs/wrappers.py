@@ -181,7 +181,7 @@ class Distraction(gym.Wrapper[Any, np.ndarray, Any, np.ndarray], gym.utils.Recor
         gym.utils.RecordConstructorArgs.__init__(self, motion=motion, strength=strength, jitter=jitter)
         gym.Wrapper.__init__(self, env)
         space = env.observation_space
-        if space.shape is None or space.dtype != np.uint8 or space.shape != (space.shape[0], space.shape[0], 3):
+        if space.shape is None or space.dtype != np.uint8 or space.shape != (*space.shape[:1] * 2, 3):
             raise ValueError(f"Distraction needs square RGB images of uint8, channels last, got {space}")
         if motion not in ("swing", "drift"):
             raise ValueError(f"motion must be 'swing' or 'drift', got {motion!r}")

@@ -15,10 +15,10 @@ from sb3_por.analysis.controls import MEASURES, Controls
 from sb3_por.analysis.fresh_heads import judgement, train_head
 from sb3_por.analysis.played import Played, encode, play
 from sb3_por.common.errors import UserError
+from sb3_por.common.plain import LACKS_VALUES
 from sb3_por.evaluation.episodes import evaluation_episodes
 from sb3_por.evaluation.environment import make_evaluation_env
 from sb3_por.evaluation.loading import resolve
-from sb3_por.evaluation.safe_loading import LACKS_VALUES
 from sb3_por.objectives.por import PartialOrder
 from sb3_por.runs.environment import EnvWrapper, VecEnvWrapper
 from sb3_por.runs.facts import run_identity

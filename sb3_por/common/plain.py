@@ -10,6 +10,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 #: Attribute of a model that holds its description; JSON in its ``.zip``
 ATTRIBUTE = "plain_description"
+#: Attribute of a model whose file holds no Q networks, so that its own are as they were initialized
+LACKS_VALUES = "lacks_values"
 #: Arguments of an algorithm that have no place in a description: they concern learning, memory or the machine
 LEFT_OUT = (
     *("policy", "env", "policy_kwargs", "device", "_init_setup_model", "seed", "verbose", "tensorboard_log"),

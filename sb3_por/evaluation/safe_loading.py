@@ -50,8 +50,6 @@ WRAPPERS = (
     "sb3_contrib.common.wrappers.TimeFeatureWrapper",
     "stable_baselines3.common.vec_env.VecFrameStack",
 )
-#: Attribute of a model whose file holds no Q networks, so that its own are as they were initialized
-LACKS_VALUES = "lacks_values"
 #: Most values among the arguments of an environment
 MAX_VALUES = 10_000
 #: Most parameters of a policy, and most tensors of them: a number in a file cannot fill the memory
@@ -223,7 +221,7 @@ def _load_networks(model: BaseAlgorithm, tensors: dict[str, th.Tensor]) -> None:
         raise ValueError(f"{len(names)} tensors do not fit a {type(model.policy).__name__}, {names[0]!r:.80} among them")
     targets = {name: tensors[name.replace("critic_target.", "critic.", 1)] for name in missing & _of_target(tensors)}
     model.policy.load_state_dict({**own, **targets, **tensors})
-    vars(model)[LACKS_VALUES] = bool(missing)
+    vars(model)[plain.LACKS_VALUES] = bool(missing)
 
 
 def _of_target(tensors: dict[str, th.Tensor]) -> set[str]:

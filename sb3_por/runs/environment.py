@@ -201,11 +201,14 @@ def with_rankers_by_name(spec: Any) -> list[Any]:
     :param spec: Wrappers, see :func:`import_wrappers`
     :return: The same with the name of each ranker's file instead of its path
     """
-    return [
-        {path: {**given, "ranker": Path(given["ranker"]).name}} if rankers([one]) else one
-        for one in _as_list(spec)
-        for path, given in (next(iter(one.items())) if isinstance(one, dict) else (one, {}),)
-    ]
+
+    def with_name(wrapper: Any) -> Any:
+        if not rankers([wrapper]):
+            return wrapper
+        ((path, arguments),) = wrapper.items()
+        return {path: {**arguments, "ranker": Path(arguments["ranker"]).name}}
+
+    return [with_name(one) for one in _as_list(spec)]
 
 
 def _paths(wrapper: Any) -> list[Any]:

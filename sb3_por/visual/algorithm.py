@@ -225,7 +225,7 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
         :param progress_bar: Show a progress bar
         :return: The model
         """
-        if vars(self).get("lacks_values"):
+        if vars(self).get(plain.LACKS_VALUES):
             raise UserError("an exported agent only plays: it holds no Q networks; to train on, take the model of its run")
         self.environment_made_of = made_of(self.env)
         name = type(self).__name__ if tb_log_name is None else tb_log_name

@@ -157,7 +157,7 @@ def test_wrong_distractions_are_refused(arguments):
     grey = gym.wrappers.GrayscaleObservation(images, keep_dim=True)
     oblong = gym.wrappers.ResizeObservation(images, (40, 60))
     floats = gym.wrappers.TransformObservation(images, lambda o: o / 255, gym.spaces.Box(0.0, 1.0, (40, 40, 3), np.float32))
-    for env in (gym.make(ID, obs_type="state"), grey, oblong, floats):
+    for env in (gym.make(ID, obs_type="state"), gym.make("FrozenLake-v1"), grey, oblong, floats):
         with pytest.raises(ValueError, match="square RGB images of uint8"):
             Distraction(env, motion="swing")
 

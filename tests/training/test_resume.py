@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,20 @@ EVALUATED = [150, 300, 450, 600, 700]
 FLAGS = ["--algo", "sac", "--env", "Pendulum-v1", "-n", str(N_STEPS), "--seed", "1", "--num-threads", "1"]
 OFTEN = ["--save-freq", "50", "--eval-freq", "150", "--eval-episodes", "1", "--save-replay-buffer"]
 SMALL = ["-params", "learning_starts:50", "buffer_size:500", "batch_size:16"]
+
+
+@contextmanager
+def killed_at(step):
+    """The run inside ends at a step as if it had been killed there."""
+
+    def die(callback):
+        if callback.num_timesteps == step:
+            raise RuntimeError("killed")
+        return True
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(RuntimeError, match="killed"):
+        patch.setattr("sb3_por.training.experiment.CheckpointCallback._on_step", die)
+        yield
 
 
 def model_with(n_transitions):
@@ -239,15 +254,8 @@ def test_a_killed_run_ends_bit_for_bit_as_one_that_was_stopped_at_its_last_check
 
 
 def test_a_resumed_run_forgets_the_episodes_that_it_plays_again_and_removes_half_a_file(tmp_path, monkeypatch):
-    def die(callback):
-        if callback.num_timesteps == 220:
-            raise RuntimeError("killed")
-        return True
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sb3_por.training.experiment.CheckpointCallback._on_step", die)
-        with pytest.raises(RuntimeError, match="killed"):
-            main([*FLAGS, "-n", "360", "--save-freq", "150", "--eval-freq", "300", "-f", str(tmp_path), *SMALL])
+    with killed_at(220):
+        main([*FLAGS, "-n", "360", "--save-freq", "150", "--eval-freq", "300", "-f", str(tmp_path), *SMALL])
     run = tmp_path / "sac" / "Pendulum-v1_1"
     monitor = run / "0.monitor.csv"
     with open(monitor, "a") as file:
@@ -325,20 +333,13 @@ def test_resume_of_what_is_finished_no_run_or_in_use_is_said(tmp_path, capsys):
     assert (run / "Pendulum-v1" / "args.yml").exists()
 
 
-def test_a_run_that_began_with_a_model_is_resumed_without_that_model(tmp_path, capsys, monkeypatch):
+def test_a_run_that_began_with_a_model_is_resumed_without_that_model(tmp_path, capsys):
     brief = ["--eval-freq", "-1", "--save-freq", "20"]
     assert main([*FLAGS, *brief, "-n", "30", "-f", str(tmp_path / "first"), *SMALL]) == 0
     start = tmp_path / "first" / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip"
 
-    def die(callback):
-        if callback.num_timesteps == 55:
-            raise RuntimeError("killed")
-        return True
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sb3_por.training.experiment.CheckpointCallback._on_step", die)
-        with pytest.raises(RuntimeError, match="killed"):
-            main([*FLAGS, *brief, "-n", "100", "-i", str(start), "-f", str(tmp_path / "second"), *SMALL])
+    with killed_at(55):
+        main([*FLAGS, *brief, "-n", "100", "-i", str(start), "-f", str(tmp_path / "second"), *SMALL])
     run = tmp_path / "second" / "sac" / "Pendulum-v1_1"
     assert main(["--resume", str(run), "-i", str(start)]) == 2
     assert "--resume continues a run with its own model; leave out -i" in capsys.readouterr().err
@@ -400,7 +401,7 @@ def test_a_finished_run_is_extended_in_its_folder(keeps_buffer, tmp_path, capsys
         assert file["timesteps"].tolist() == [60, 90] and (np.diff(file["wall_clock_s"]) > 0).all()
 
 
-def test_an_extension_that_is_interrupted_is_resumed_again(tmp_path, monkeypatch):
+def test_an_extension_that_is_interrupted_is_resumed_again(tmp_path):
     """Killed once after a checkpoint of its own and once before the next one, it ends like one that nobody has killed."""
     often = ["--save-freq", "50", "--eval-freq", "40", "--eval-episodes", "1", "--save-replay-buffer"]
     runs = []
@@ -410,21 +411,11 @@ def test_an_extension_that_is_interrupted_is_resumed_again(tmp_path, monkeypatch
     whole, killed = runs
     assert main(["--resume", str(whole), "-n", "230"]) == 0
 
-    def die_at(step):
-        def die(callback):
-            if callback.num_timesteps == step:
-                raise RuntimeError("killed")
-            return True
-
-        monkeypatch.setattr("sb3_por.training.experiment.CheckpointCallback._on_step", die)
-
     for step, more, checkpoint in ((130, ["-n", "230"], "step_100"), (145, [], "step_100"), (180, [], "step_150")):
-        die_at(step)
-        with pytest.raises(RuntimeError, match="killed"):
+        with killed_at(step):
             main(["--resume", str(killed), *more])
         assert latest_checkpoint(killed).name == checkpoint
         assert not is_finished(killed, "Pendulum-v1"), "the model of 60 steps is not the last one"
-        monkeypatch.undo()
     assert main(["--resume", str(killed)]) == 0
     assert latest_checkpoint(killed) is None and is_finished(killed, "Pendulum-v1")
     for run in runs:

@@ -4,14 +4,14 @@ Play all tasks for a long time, and watch the process and the physics.
     make soak                                                   an hour
     make soak SOAK=15                                           15 minutes
     python benchmarks/soak.py --workers 4                       the same in worker processes
-    python benchmarks/soak.py --models logs/sac_por/PourWater-v0_1   with agents besides random play and the experts
     python benchmarks/soak.py --plot                            draws from the committed tables
 
-Every episode of every task is played by one policy after the other, from each kind of observation. `soak.csv` has a row for
-each round over all of them: memory, file descriptors, threads and temporary files of the process and its workers.
-`plays.csv` has the control steps and the faults of each task and policy: what the environment reported (`sim_error`), what an
-audit of Bullet's own positions found although nothing was reported, observations and rewards that were not finite, and the
-extremes of rope, cloth and water.
+Random play, the expert and the best trained agent that comes with the package play an episode of every task, one after the
+other, from each kind of observation. `one_process_rounds.csv` (`workers_rounds.csv` with `--workers`) has a row for each round
+over all of them: memory, file descriptors, threads and temporary files of the process and its workers. `..._plays.csv` has the
+control steps and the faults of each task and policy: what the environment reported (`sim_error`), what an audit of Bullet's
+own positions found although nothing was reported, observations and rewards that were not finite, and the extremes of rope,
+cloth and water.
 """
 
 import argparse
@@ -33,8 +33,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_por.evaluation.environment import make_evaluation_env
 from sb3_por.evaluation.loading import resolve
-from sb3_por.evaluation.model_files import model_file
-from sb3_por.runs.facts import run_identity
+from sb3_por.sharing.agents import PRETRAINED, find_agent, read_agents
 from softbody_envs import ENV_IDS
 from softbody_envs.env import OBS_TYPES
 from softbody_envs.experts import has_expert, make_expert
@@ -137,7 +136,7 @@ def make(env_id: str, obs_type: str) -> gym.Env:
     return Audited(gym.make(env_id, obs_type=obs_type))
 
 
-def plays(n_workers: int, models: list[Path]) -> list[tuple[str, str, str, Callable[[], tuple[VecEnv, Any]]]]:
+def plays(n_workers: int) -> list[tuple[str, str, str, Callable[[], tuple[VecEnv, Any]]]]:
     """Every task, policy and kind of observation, with a function that makes environments and policy."""
 
     def vectorized(env_id: str, obs_type: str) -> VecEnv:
@@ -152,21 +151,20 @@ def plays(n_workers: int, models: list[Path]) -> list[tuple[str, str, str, Calla
         env = vectorized(env_id, obs_type)
         return env, Scripted(env_id, env)
 
-    def make_trained(env_id: str, path: Path) -> tuple[VecEnv, Any]:
-        model, environment = resolve(path, env_id)
+    def make_trained(env_id: str) -> tuple[VecEnv, Any]:
+        model, environment = resolve(find_agent(env_id).model, env_id)
         wrap = environment["env_wrapper"]
         inner = Audited if wrap is None else lambda env: wrap(Audited(env))
         return make_evaluation_env(model, env_id, **environment | {"env_wrapper": inner}), Trained(model)
 
+    with_agent = {agent.facts["env"] for agent in read_agents(PRETRAINED)}
     found: list[tuple[str, str, str, Callable[[], tuple[VecEnv, Any]]]] = []
     for env_id in ENV_IDS:
         found += [(env_id, "random", kind, partial(make_random, env_id, kind)) for kind in OBS_TYPES]
         if has_expert(env_id):
             found += [(env_id, "expert", kind, partial(make_scripted, env_id, kind)) for kind in ("state", "dict")]
-    for path in models:
-        model_file(path)  # one that is missing is told before the first round
-        env_id = run_identity(path)["env"]
-        found.append((env_id, "trained", "its own", partial(make_trained, env_id, path)))
+        if env_id in with_agent:
+            found.append((env_id, "trained", "its own", partial(make_trained, env_id)))
     return found
 
 
@@ -197,12 +195,12 @@ def resources(folder: str) -> dict[str, float]:
     }
 
 
-def soak(minutes: float, n_workers: int, models: list[Path], folder: str) -> Iterator[tuple[pd.DataFrame, pd.DataFrame]]:
+def soak(minutes: float, n_workers: int, folder: str) -> Iterator[tuple[pd.DataFrame, pd.DataFrame]]:
     """
     :return: after each round, a row for each round so far, and a row for each task and policy
     """
     begin = time.monotonic()
-    todo = plays(n_workers, models)
+    todo = plays(n_workers)
     rounds: list[dict[str, float]] = []
     totals: dict[tuple[str, str], dict[str, float]] = {}
     steps = 0.0
@@ -249,7 +247,6 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("results/soak"))
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--workers", type=int, default=0, help="worker processes; 0 plays in this one")
-    parser.add_argument("--models", nargs="*", type=Path, default=[], help="folders of runs whose agents play, too")
     parser.add_argument("--plot", action="store_true", help="only draw")
     arguments = parser.parse_args()
     matplotlib.use("Agg")
@@ -259,7 +256,7 @@ def main() -> None:
     if not arguments.plot:
         with tempfile.TemporaryDirectory() as folder:
             tempfile.tempdir = os.environ["TMPDIR"] = folder  # temporary files of nobody else
-            for tables in soak(arguments.minutes, arguments.workers, arguments.models, folder):
+            for tables in soak(arguments.minutes, arguments.workers, folder):
                 for table, file in zip(tables, files, strict=True):
                     table.to_csv(file, index=False)
     rounds, table = (pd.read_csv(file) for file in files)

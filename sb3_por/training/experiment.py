@@ -239,18 +239,34 @@ class Experiment(ExperimentManager):
         return env
 
     def hyperparameters_optimization(self) -> None:
-        """Report in one line why a search has failed, and leave no run's folder behind."""
-        handler = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
+        """
+        Report in one line why a search has failed or was ended, and leave no run's folder behind. The zoo writes its report of
+        the finished trials after Ctrl-C; SIGTERM counts as that.
+        """
+
+        def interrupt(number: int, frame: Any) -> None:
+            self._interrupted = True
+            raise KeyboardInterrupt
+
+        handlers = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             super().hyperparameters_optimization()
         except Exception as error:  # of any database's driver, sampler or trial
             if self.verbose > 1:
                 raise
-            raise UserError(f"the search of {self.algo} has failed: {one_line(error)} (--verbose 2 shows where)") from error
+            if not self._interrupted:  # else the zoo misses a trial that has ended
+                raise UserError(
+                    f"the search of {self.algo} has failed: {one_line(error)} (--verbose 2 shows where)"
+                ) from error
         finally:
-            signal.signal(signal.SIGTERM, handler)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
             if self._folder_made:
                 shutil.rmtree(self.save_path, ignore_errors=True)
+        if self._interrupted:
+            raise KeyboardInterrupt(
+                "interrupted; with --storage and --study-name, the same command adds to the trials that ended"
+            )
 
     def create_callbacks(self) -> None:
         """Our evaluation and checkpoints, counted in environment steps."""

@@ -235,6 +235,20 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
             warnings.warn("bc_coef has no effect without demonstrations: give demos, or train.py --demos", UserNote)
         return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
 
+    @classmethod
+    def load(cls, path: Any, *args: Any, **kwargs: Any) -> Any:
+        """
+        :param path: As all else, SB3's
+        :return: The model
+        :raises UserError: If the file holds no pickled code, and so neither the spaces that SB3 asks for
+        """
+        try:
+            return super().load(path, *args, **kwargs)
+        except KeyError as error:
+            if "observation_space" not in str(error):
+                raise
+            raise UserError(f"{path} was exported without pickled code: load it with sb3_por.evaluation.load_safe") from error
+
     @staticmethod
     def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         return OffPolicyAlgorithm._wrap_env(transpose_inside(env), verbose, monitor_wrapper)

@@ -1,6 +1,7 @@
 """Agents for others: exported from a run, found by task, loaded without running anything, and scored as published."""
 
 import json
+import re
 import resource
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import imageio.v2 as imageio
 import pytest
 
+from sb3_por import SACPOR
 from sb3_por.__main__ import main
 from sb3_por.common.errors import UserError
 from sb3_por.evaluation import evaluate, load_safe
@@ -65,6 +67,12 @@ def test_an_exported_agent_is_small_and_holds_no_pickled_code(folder):
         assert archive.namelist() == ["data", "policy.pth", "_stable_baselines3_version"]
         assert b"serialized" not in archive.read("data")
     assert type(load_safe(folder / "sac_por-PourWater-v0.zip")).__name__ == "SACPOR"
+
+
+def test_sb3s_way_to_load_it_names_the_one_that_can(folder):
+    file = find_agent("PourWater-v0", folder=folder).model
+    with pytest.raises(UserError, match=re.escape(f"{file} was exported without pickled code: load it with sb3_por.eval")):
+        SACPOR.load(file)
 
 
 def test_an_exported_agent_tells_what_it_was(run, folder):

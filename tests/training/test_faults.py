@@ -200,6 +200,15 @@ def test_every_question_to_a_lost_worker_is_an_error_in_words(ask, workers):
         ask(workers)
 
 
+def test_a_worker_that_ends_while_it_starts_is_an_error_and_takes_the_others_with_it():
+    before = set(psutil.Process().children(recursive=True))
+    with pytest.raises(UserError, match="an environment process ended while it made its environment"):
+        WorkerProcesses([partial(gym.make, "Pendulum-v1"), partial(os._exit, 3)])
+    started = set(psutil.Process().children(recursive=True)) - before
+    # What stays are multiprocessing's own two, which the next workers use.
+    wait_for(lambda: sum(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in started) <= 2)
+
+
 @pytest.mark.slow
 def test_workers_end_with_a_process_that_does_not_close_them(tmp_path):
     script = tmp_path / "leaves.py"

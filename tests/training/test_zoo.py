@@ -7,13 +7,17 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import optuna
 import pytest
 import rl_zoo3
 import yaml
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
 from rl_zoo3.utils import get_saved_hyperparams, get_trained_models
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
@@ -239,6 +243,28 @@ def test_a_search_leaves_its_report_and_no_run(tmp_path, capsys):
     assert main([*PENDULUM, *flags, *SMALL]) == 0
     assert {path.suffix for path in (tmp_path / "sac").iterdir()} == {".csv", ".pkl"}
     assert main(["--resume", str(tmp_path), "-optimize"]) == 2
+
+
+@pytest.mark.parametrize(("number", "n_ended"), [(signal.SIGTERM, 2), (signal.SIGINT, 0)])
+def test_a_search_that_is_told_to_end_keeps_the_trials_that_have_ended(number, n_ended, tmp_path, monkeypatch, capsys):
+    score, trials = Experiment._scored_episodes, []
+
+    def tell(experiment):
+        trials.append(experiment)
+        if len(trials) > n_ended:
+            os.kill(os.getpid(), number)
+            time.sleep(0.01)
+        return score(experiment)
+
+    monkeypatch.setattr(Experiment, "_scored_episodes", tell)
+    file = str(tmp_path / "study.log")
+    flags = ["-optimize", "--n-trials", "9", "--no-optim-plots", "--n-evaluations", "1", "-n", "60", "-f", str(tmp_path)]
+    assert main([*PENDULUM, *flags, "--storage", file, "--study-name", "s", *SMALL]) == 130
+    assert capsys.readouterr().err.splitlines()[-1].startswith("train.py: interrupted; with --storage and --study-name, ")
+    study = optuna.load_study(study_name="s", storage=JournalStorage(JournalFileBackend(file)))
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * n_ended + ["FAIL"]
+    reports = list((tmp_path / "sac").glob("report_*.csv")) if n_ended else []
+    assert len(reports) == (n_ended > 0)
 
 
 def test_a_search_does_not_see_the_held_out_episodes(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@ Play all tasks for a long time, and watch the process and the physics.
 
     make soak                                                   an hour
     make soak SOAK=15                                           15 minutes
+    make soak ARGS=--more                                       another hour, added to the committed tables
     python benchmarks/soak.py --workers 4                       the same in worker processes
     python benchmarks/soak.py --plot                            draws from the committed tables
 
@@ -195,15 +196,24 @@ def resources(folder: str) -> dict[str, float]:
     }
 
 
-def soak(minutes: float, n_workers: int, folder: str) -> Iterator[tuple[pd.DataFrame, pd.DataFrame]]:
+def soak(
+    minutes: float, n_workers: int, folder: str, earlier: tuple[pd.DataFrame, pd.DataFrame] | None
+) -> Iterator[tuple[pd.DataFrame, pd.DataFrame]]:
     """
-    :return: after each round, a row for each round so far, and a row for each task and policy
+    :param minutes: How long to play
+    :param n_workers: Worker processes; 0 plays in this one
+    :param folder: Folder of temporary files
+    :param earlier: What an earlier process returned
+    :return: After each round, a row for each round so far, and a row for each task and policy
     """
     begin = time.monotonic()
     todo = plays(n_workers)
-    rounds: list[dict[str, float]] = []
+    rounds: list[dict[str, Any]] = []
     totals: dict[tuple[str, str], dict[str, float]] = {}
-    steps = 0.0
+    if earlier is not None:
+        rounds = earlier[0].to_dict("records")
+        totals = {(row.pop("env"), row.pop("policy")): row for row in earlier[1].to_dict("records")}
+    process, steps = (rounds[-1]["process"] + 1, rounds[-1]["steps"]) if rounds else (1, 0)
     while time.monotonic() - begin < 60 * minutes:
         for env_id, policy_name, _, prepare in todo:
             env, policy = prepare()
@@ -213,18 +223,21 @@ def soak(minutes: float, n_workers: int, folder: str) -> Iterator[tuple[pd.DataF
             total = totals.setdefault((env_id, policy_name), dict.fromkeys(done, 0.0) | dict.fromkeys(EXTREMES, np.nan))
             for name, value in done.items():
                 total[name] = np.fmax(total[name], value) if name in EXTREMES else total[name] + value
-        rounds.append({"minutes": round((time.monotonic() - begin) / 60, 2), "steps": steps, **resources(folder)})
+        played = round((time.monotonic() - begin) / 60, 2)
+        rounds.append({"process": process, "minutes": played, "steps": steps, **resources(folder)})
         print(rounds[-1], flush=True)
         table = pd.DataFrame([{"env": env_id, "policy": name, **values} for (env_id, name), values in totals.items()])
         yield pd.DataFrame(rounds).astype({"steps": int}), table.astype(dict.fromkeys(COUNTS, int)).round(3)
 
 
 def summary(rounds: pd.DataFrame, table: pd.DataFrame) -> str:
-    """One line. Growth is counted from the second round on: the first one loads what is loaded once."""
-    first, last = rounds.iloc[min(1, len(rounds) - 1)], rounds.iloc[-1]
-    growth = ", ".join(f"{name} {last[name] - first[name]:+.0f}" for name in rounds.columns[2:])
+    """One line. Growth is that of the worst process, from its second round on: the first one loads what is loaded once."""
+    processes = [process for _, process in rounds.groupby("process")]
+    grown = pd.DataFrame([one.iloc[-1] - one.iloc[min(1, len(one) - 1)] for one in processes]).max()
+    growth = ", ".join(f"{name} {grown[name]:+.0f}" for name in rounds.columns[3:])
     faults = ", ".join(f"{name} {table[name].sum()}" for name in ("reported", "unreported", "nan"))
-    played = f"{table['steps'].sum()} control steps, {table['episodes'].sum()} episodes in {last['minutes']:.0f} min"
+    minutes = sum(one["minutes"].iloc[-1] for one in processes)
+    played = f"{table['steps'].sum()} control steps, {table['episodes'].sum()} episodes in {minutes:.0f} min"
     return f"{played}: {faults}; {growth}"
 
 
@@ -233,8 +246,10 @@ def draw(rounds: pd.DataFrame, path: Path) -> None:
     figure = Figure(figsize=(9, 2.4), layout="constrained")
     axes = figure.subplots(1, 3)
     for axis, names in zip(axes, (["memory_mb"], ["file_descriptors", "threads"], ["temporary_files"]), strict=True):
-        for name in names:
-            axis.plot(rounds["steps"], rounds[name], label=name.replace("_", " "))
+        for number, name in enumerate(names):
+            for process, part in rounds.groupby("process"):
+                label = name.replace("_", " ") if process == 1 else None
+                axis.plot(part["steps"], part[name], color=f"C{number}", label=label)
         axis.set_ylim(bottom=0)
         axis.set_xlabel("control steps")
         axis.legend(frameon=False)
@@ -247,16 +262,18 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("results/soak"))
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--workers", type=int, default=0, help="worker processes; 0 plays in this one")
+    parser.add_argument("--more", action="store_true", help="add to the tables that are there")
     parser.add_argument("--plot", action="store_true", help="only draw")
     arguments = parser.parse_args()
     matplotlib.use("Agg")
     arguments.output.mkdir(parents=True, exist_ok=True)
     name = "workers" if arguments.workers else "one_process"
     files = [arguments.output / f"{name}_{what}.csv" for what in ("rounds", "plays")]
+    earlier = tuple(pd.read_csv(file) for file in files) if arguments.more else None
     if not arguments.plot:
         with tempfile.TemporaryDirectory() as folder:
             tempfile.tempdir = os.environ["TMPDIR"] = folder  # temporary files of nobody else
-            for tables in soak(arguments.minutes, arguments.workers, folder):
+            for tables in soak(arguments.minutes, arguments.workers, folder, earlier):
                 for table, file in zip(tables, files, strict=True):
                     table.to_csv(file, index=False)
     rounds, table = (pd.read_csv(file) for file in files)

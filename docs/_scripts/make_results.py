@@ -388,14 +388,12 @@ def soak() -> str:
 
 
 def soak_process() -> str:
-    """Tabulate what the process held after the first and after the last round over all tasks."""
+    """Tabulate what each process held after its first and after its last round over all tasks."""
     rounds = pd.read_csv(RESULTS / "soak" / "one_process_rounds.csv")
-    head = ("after control steps", "minutes", "memory, MB", "file descriptors", "threads", "temporary files")
-    ends = rounds.iloc[[0, -1]] if len(rounds) > 1 else rounds
-    cells = zip(
-        *(ends[name].astype(int).astype(str) for name in ("steps", "minutes", "memory_mb", *rounds.columns[3:])), strict=True
-    )
-    return markdown(head, cells)
+    head = ("process", "after control steps", "minutes", "memory, MB", "file descriptors", "threads", "temporary files")
+    ends = pd.concat([part.iloc[[0, -1]] for _, part in rounds.groupby("process")]).drop_duplicates()
+    columns = ("process", "steps", "minutes", "memory_mb", *rounds.columns[4:])
+    return markdown(head, zip(*(ends[name].astype(int).astype(str) for name in columns), strict=True))
 
 
 def scores_of(algo: str) -> str:

@@ -27,6 +27,7 @@ TOLD = {
     # -- what the user names as a model to be used: with a note if train.py did not write it here, and --safe runs nothing
     ("sb3_por/evaluation/loading.py", "load_model", "load"): "SB3's own files; after note_foreign, and not for plain files",
     ("sb3_por/common/random_state.py", "load", "load"): "SB3's method, extended",
+    ("sb3_por/visual/algorithm.py", "load", "load"): "SB3's method, extended",
     ("sb3_por/evaluation/environment.py", "_normalize", "load"): "statistics of the same model",
     # -- train.py --resume and -i: after note_foreign
     ("sb3_por/training/experiment.py", "_load_pretrained_agent", "_load_pretrained_agent"): "the model that the user resumes",

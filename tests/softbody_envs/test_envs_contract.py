@@ -392,7 +392,7 @@ def test_async_vector_env_plays_as_one_process_does(env_id):
 # -- memory ------------------------------------------------------------------------------------------------------------
 
 
-def _growth(env_id, warmup, n):
+def _growth(env_id, warmup, n, options=None):
     """Resident memory that ``n`` resets with a step and an image each add after some to warm up, MB."""
     env = make(env_id)
     env.action_space.seed(0)
@@ -401,7 +401,7 @@ def _growth(env_id, warmup, n):
         if i == warmup:
             gc.collect()
             before = process.memory_info().rss
-        env.reset(seed=i)
+        env.reset(seed=i, options=options)
         env.step(env.action_space.sample())
     gc.collect()
     after = process.memory_info().rss
@@ -417,9 +417,10 @@ def test_memory_does_not_grow_with_resets(env_id):
 @pytest.mark.slow
 @for_every_task
 def test_memory_does_not_grow_with_many_resets(env_id):
-    growth = _growth(env_id, warmup=10, n=500)
+    """Bullet kept 5.7 kB of each scene of pouring: 2.8 MB here. A cloth's heap settles at 1.9 MB more."""
+    growth = _growth(env_id, warmup=100, n=500, options={"variation": 3})
     print(env_id, f"{growth:.1f} MB")
-    assert growth < 20
+    assert growth < 2.4
 
 
 def test_a_scene_that_starts_solved_is_refused():

@@ -269,8 +269,9 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     name = "workers" if arguments.workers else "one_process"
     files = [arguments.output / f"{name}_{what}.csv" for what in ("rounds", "plays")]
-    earlier = tuple(pd.read_csv(file) for file in files) if arguments.more else None
     if not arguments.plot:
+        has_earlier = arguments.more and all(file.is_file() for file in files)
+        earlier = (pd.read_csv(files[0]), pd.read_csv(files[1])) if has_earlier else None
         with tempfile.TemporaryDirectory() as folder:
             tempfile.tempdir = os.environ["TMPDIR"] = folder  # temporary files of nobody else
             for tables in soak(arguments.minutes, arguments.workers, folder, earlier):

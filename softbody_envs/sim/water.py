@@ -15,9 +15,9 @@ VOLUME = 4 / 3 * np.pi * RADIUS**3
 DENSITY = 1000.0
 #: SoftGym's fluid colour.
 COLOR = (0.113, 0.425, 0.55, 1.0)
-#: Particles are drawn as icosahedra whose outlines have the area of the sphere's; this takes a third of the time. Bullet never
-#: frees a mesh that it is given as numbers: 6 kB for each scene.
+#: Particles are drawn as icosahedra whose outlines have the area of the sphere's; this takes a third of the time.
 DRAWN_RADIUS = 1.14 * RADIUS
+#: An icosahedron of radius 1. A file, since Bullet never frees a mesh that it is given as numbers: 6 kB for each scene.
 MESH = Path(__file__).with_name("particle.obj")
 
 

@@ -264,10 +264,12 @@ def _check_kept(algo: str, changes: dict[str, Any] | None, own: dict[str, Any]) 
     :param changes: Settings that were given
     :param own: Settings that the loaded model was made with, or its attributes
     :raises UserError: If the former ask for other networks or another kind of temperature, which the zoo would write down
-        and not make
+        and not make; or if the model's file was edited so that this cannot be told
     """
     changes = changes or {}
     given, made = changes.get("policy_kwargs"), own.get("policy_kwargs") or {}
+    if not isinstance(made, dict):
+        raise UserError(f"the loaded model's policy_kwargs must be dict, got {made!r}")
     if isinstance(given, dict) and any(made.get(name) != value for name, value in given.items()):
         raise UserError("a loaded model keeps its networks; leave out policy_kwargs")
     parameters = inspect.signature({**ALGOS, **ALGORITHMS}[algo]).parameters

@@ -57,6 +57,7 @@ def train_further(algo, members, folder, **changes):
         ({"ep_info_buffer": "x"}, "ep_info_buffer must be deque, got 'x'"),
         ({"_n_updates": None}, "_n_updates must be Integral, got None"),
         ({"sde_sample_freq": "x"}, "sde_sample_freq must be int, got 'x'"),
+        ({"policy_kwargs": 3}, "policy_kwargs must be dict, got 3"),
     ],
 )
 def test_a_file_that_was_edited_is_refused_in_one_line(algo, changes, message, members, tmp_path, capsys):

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import ActionNoise
 
 from sb3_por.common.checks import check_types
 from sb3_por.common.errors import UserError, short
 from sb3_por.evaluation.model_files import read_data
 
-#: State of SB3's training that is no argument of a constructor: its types
+#: State of training that is no argument of a constructor (of all constructors: the noise): its types
 STATE: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(
         ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates"), (Integral,)
@@ -21,6 +22,10 @@ STATE: dict[str, tuple[type, ...]] = {
     "_stats_window_size": (Integral,),
     **dict.fromkeys(("ep_info_buffer", "ep_success_buffer"), (deque,)),
     **dict.fromkeys(("_last_obs", "_last_original_obs"), (np.ndarray, dict, type(None))),
+    "action_noise": (ActionNoise, type(None)),
+    # Of OverlappedTraining, in the file if it was saved during training
+    "_defers_updates": (bool,),
+    "_updates_due": (Integral,),
 }
 
 
@@ -48,6 +53,8 @@ def _check(data: dict[str, Any], values: dict[str, Any], model: BaseAlgorithm) -
     check_types(type(model), {name: value for name, value in values.items() if name not in ("env", "policy", "device")})
     learned = values["ep_info_buffer"] is not None or values["ep_success_buffer"] is not None
     for name, types in STATE.items():
+        if name not in values:
+            continue
         value = values[name]
         if not isinstance(value, types) and (learned or value is not None or types != (deque,)):
             expected = " or ".join(one.__name__ for one in types)

@@ -69,6 +69,18 @@ def test_a_file_that_was_edited_is_refused_in_one_line(algo, changes, message, m
     assert not list(tmp_path.glob("again/*/*")), "no folder is left behind"
 
 
+@pytest.mark.parametrize(
+    ("algo", "changes", "message"),
+    [
+        ("ppo", {"action_noise": "x"}, "action_noise must be ActionNoise or NoneType, got 'x'"),
+        ("sac_por", {"_defers_updates": "x"}, "_defers_updates must be bool, got 'x'"),
+    ],
+)
+def test_what_no_constructor_takes_is_checked_too(algo, changes, message, members, tmp_path, capsys):
+    assert train_further(algo, members(algo), tmp_path, **changes) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
 @pytest.mark.parametrize("algo", SMALL)
 def test_a_file_that_was_not_edited_is_trained_further(algo, members, tmp_path):
     assert train_further(algo, members(algo), tmp_path) == 0

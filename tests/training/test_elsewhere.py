@@ -1,4 +1,7 @@
-"""What stays the same, to the last bit, on another processor and with other threads: physics and images; weights do not."""
+"""
+What stays the same, to the last bit, on another processor, with other threads and with other versions of PyTorch: physics and
+images; weights do not. ``OTHER_TORCH`` names folders with other versions, as ``pip install --target`` writes them.
+"""
 
 import json
 import os
@@ -25,7 +28,7 @@ def digest(arrays):
         sum_.update(np.ascontiguousarray(array).tobytes())
     return sum_.hexdigest()
 
-found = {}
+found = {"torch": th.__version__}
 for env_id in ("PourWater-v0", "StraightenRope-v0", "FoldCloth-v0"):
     env = gym.make(env_id, obs_type="dict", image_size=64)
     env.action_space.seed(0)
@@ -48,6 +51,8 @@ PROCESSORS = {
     "MKL as anywhere": {"MKL_CBWR": "COMPATIBLE"},
     "NumPy without AVX": {"NPY_DISABLE_CPU_FEATURES": "AVX2,FMA3,AVX512F,AVX512CD,AVX512_SKX"},
 }
+#: Folders with other versions of PyTorch
+TORCHES = [folder for folder in os.environ.get("OTHER_TORCH", "").split(os.pathsep) if folder]
 
 
 def run(threads=1, **variables):
@@ -68,20 +73,30 @@ def test_the_same_run_on_this_machine_is_the_same(here):
     assert run() == here
 
 
+def assert_alike(there, here):
+    """Physics and images are equal, and weights nearly."""
+    assert all(there[name] == here[name] for name in here if name.endswith("-v0"))
+    assert there["size"] == pytest.approx(here["size"], rel=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("processor", PROCESSORS)
 def test_on_another_processor_physics_and_images_are_the_same_and_weights_nearly(processor, here):
-    there = run(**PROCESSORS[processor])
-    assert {name: value for name, value in there.items() if name.endswith("-v0")} == {
-        name: value for name, value in here.items() if name.endswith("-v0")
-    }
-    assert there["size"] == pytest.approx(here["size"], rel=1e-3)
+    assert_alike(run(**PROCESSORS[processor]), here)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_with_two_threads_physics_and_images_are_the_same_and_weights_nearly(here):
-    there = run(threads=2)
-    assert all(there[name] == here[name] for name in here if name.endswith("-v0"))
-    assert there["size"] == pytest.approx(here["size"], rel=1e-3)
+    assert_alike(run(threads=2), here)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.skipif(not TORCHES, reason="OTHER_TORCH names no folder with another version of PyTorch")
+@pytest.mark.parametrize("folder", TORCHES)
+def test_with_another_pytorch_physics_and_images_are_the_same_and_weights_nearly(folder, here):
+    there = run(PYTHONPATH=os.pathsep.join([str(ROOT), folder]))
+    assert there["torch"] != here["torch"]
+    assert_alike(there, here)

@@ -96,4 +96,4 @@ def test_the_script_for_slurm_runs_a_suite_on_three_machines(network, tmp_path):
     said = done.stdout + done.stderr
     assert done.returncode == 0, said
     assert len(list(work.glob("runs/mine/**/Pendulum-v1.zip"))) == 3, said
-    assert "3 runs" in said, said
+    assert "3 of 3 runs finished" in said, said

@@ -13,7 +13,7 @@ from sb3_por.common.checks import check_types
 from sb3_por.common.errors import UserError, short
 from sb3_por.evaluation.model_files import read_data
 
-#: State of training that is no argument of a constructor (of all constructors: the noise): its types
+#: State of training that not every constructor takes: its types
 STATE: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(
         ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates"), (Integral,)

@@ -17,9 +17,10 @@ RADIUS = 0.009
 SEGMENT_MASS = 0.005
 #: Simulation steps per control step. With fewer, fast pulls stretch the rope.
 STEPS_PER_CONTROL = 56
-#: SoftGym's rope colour, and the colour of the end segments: without it, ends in a heap look like bends.
+#: SoftGym's rope colour, and the colours of the first and the last segment: with the rope's, ends in a heap look like bends,
+#: and which of two equal ends a picker is bound for could not be seen.
 COLOR = (0.0, 0.5, 1.0, 1.0)
-END_COLOR = (1.0, 0.8, 0.0, 1.0)
+END_COLORS = ((1.0, 0.8, 0.0, 1.0), (1.0, 0.0, 0.8, 1.0))
 #: The simulation has failed if the length differs by more than this fraction, or a coordinate is larger than this, m.
 MAX_STRETCH = 0.2
 MAX_DISTANCE = 2.0
@@ -46,20 +47,21 @@ class Rope:
         client.setPhysicsEngineParameter(numSolverIterations=10, erp=1.0)
         world.contact_breaking_threshold = 0.004
         shape = client.createCollisionShape(pybullet.GEOM_SPHERE, radius=RADIUS)
-        look, end_look = (
+        middle, first, last = (
             client.createVisualShape(pybullet.GEOM_CAPSULE, radius=RADIUS, length=SPACING, rgbaColor=color)
-            for color in (COLOR, END_COLOR)
+            for color in (COLOR, *END_COLORS)
         )
+        looks = [first, *[middle] * (N_SEGMENTS - 2), last]
         self._segments = [
             client.createMultiBody(
                 SEGMENT_MASS,
                 shape,
-                end_look if i in (0, N_SEGMENTS - 1) else look,
+                look,
                 basePosition=(start + end) / 2,
                 baseOrientation=_orientation(end - start),
                 useMaximalCoordinates=True,
             )
-            for i, (start, end) in enumerate(pairwise(nodes))
+            for look, (start, end) in zip(looks, pairwise(nodes), strict=True)
         ]
         for segment in self._segments:
             client.changeDynamics(segment, -1, lateralFriction=1.0, restitution=0.0, linearDamping=0.99, angularDamping=0.99)

@@ -30,8 +30,9 @@ class StraightenRopeEnv(PickerEnv):
     A crumpled rope lies on the floor, seen from directly above. Two pickers hover over it. Straighten the rope: pull its
     ends apart until their distance is its length.
 
-    The rope is a chain of 20 rigid segments, 0.5 m long, blue with yellow ends. The pickers are a red and a green sphere.
-    They are darker while they hold something. The distance of a picker from its shadow shows its height.
+    The rope is a chain of 20 rigid segments, 0.5 m long, blue with a yellow end (node 0) and a magenta one (node 20). The
+    pickers are a red and a green sphere. They are darker while they hold something. The distance of a picker from its shadow
+    shows its height.
 
     ## Action Space
 

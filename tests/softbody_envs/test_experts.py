@@ -42,6 +42,21 @@ def test_experts_act_well_through_repeated_actions(env_id, repeat, scale, kwargs
     assert np.mean(scores) >= lowest, scores
 
 
+@pytest.mark.parametrize(
+    "env_id, kwargs", [("PourWater-v0", {}), ("StraightenRope-v0", {}), ("StraightenRope-v0", {"keep_hold": True})]
+)
+def test_an_expert_that_is_imitated_from_images_has_no_memory(env_id, kwargs):
+    """Who sees what it sees, but not what it has done, can do the same."""
+    env = gym.make(env_id, obs_type="state", **kwargs)
+    state, _ = env.reset(options={"variation": 3})
+    expert = make_expert(env_id, Pace.of(env))
+    for _ in range(12):
+        action = expert.act(state)
+        np.testing.assert_array_equal(action, make_expert(env_id, Pace.of(env)).act(state))
+        state, *_ = env.step(action.astype(np.float32))
+    env.close()
+
+
 def test_a_pace_is_read_off_the_wrappers():
     env = gym.make("FoldCloth-v0", keep_hold=True)
     assert Pace.of(env) == Pace(keep_hold=True)

@@ -100,6 +100,8 @@ def _record_arguments(parser: argparse.ArgumentParser) -> None:
     add_ranker_arguments(parser)
     parser.add_argument("-o", "--output", required=True, help="folder of the new dataset, in Minari's format")
     parser.add_argument("-n", "--n-episodes", type=int, default=50, help="episodes of training scenes (default 50)")
+    disturbances = "probability that a step is followed by random ones, which are not recorded (default 0)"
+    parser.add_argument("--disturbed", type=float, default=0.0, metavar="P", help=disturbances)
     parser.add_argument("--seed", type=seed, default=0, help="chooses the scenes (default 0)")
 
 
@@ -117,7 +119,7 @@ def _record(args: argparse.Namespace) -> None:
         if made_of is None:
             raise UserError("--ranker adds to the settings of an algorithm: give --algo, too")
         made_of = replace(made_of, env_wrapper=with_ranker(made_of.env_wrapper, args.ranker, args.ranker_kwargs))
-    print(record(args.model, args.env, args.output, args.n_episodes, args.seed, made_of, args.safe))
+    print(record(args.model, args.env, args.output, args.n_episodes, args.seed, made_of, args.safe, args.disturbed))
     print(args.output)
 
 

@@ -32,37 +32,66 @@ from softbody_envs.experts.pace import Pace
 
 #: Name of the scripted expert among models.
 EXPERT = "expert"
+#: Fewest and most steps of a disturbance
+DISTURBANCE_STEPS = (3, 8)
 
 
 class Recorder(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
     """
     Keep every episode that ends in ``episodes``; one that a reset cuts off is lost.
 
+    An expert that never errs does not show how an error is made good. A disturbance is one random action, held for a few
+    steps (``DISTURBANCE_STEPS``). It is not recorded: what comes before it and what comes after it are episodes of their own,
+    so that nobody learns to err (after DART, https://arxiv.org/abs/1703.09327, which adds noise to actions).
+
     :param env: The environment
+    :param disturbed: Probability that a disturbance follows a step
     """
 
-    def __init__(self, env: gym.Env[Any, np.ndarray]) -> None:
+    def __init__(self, env: gym.Env[Any, np.ndarray], disturbed: float = 0.0) -> None:
         super().__init__(env)
         self.episodes: list[RecordedEpisode] = []
+        self.disturbed = disturbed
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See ``gymnasium.Env.reset``."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._seed = seed
-        self._observations, self._actions, self._rewards = [deepcopy(observation)], list[np.ndarray](), list[float]()
+        self._seed, self._rng = seed, np.random.default_rng(seed)
+        self._begin(observation)
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """See ``gymnasium.Env.step``."""
+        """See ``gymnasium.Env.step``; with a disturbance, the sum of the rewards until it ends, and what it ends with."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._observations.append(deepcopy(observation))  # some environments reuse their arrays
         self._actions.append(np.array(action))
         self._rewards.append(float(reward))
         if terminated or truncated:
-            observations = _stack(self._observations)
-            actions, rewards = np.stack(self._actions), np.array(self._rewards)
-            self.episodes.append(RecordedEpisode(observations, actions, rewards, terminated, self._seed))
+            self._keep(terminated)
+        elif self._rng.random() < self.disturbed:
+            self._keep(terminated=False)
+            push, total = self._random_action(), float(reward)
+            for _ in range(self._rng.integers(*DISTURBANCE_STEPS, endpoint=True)):
+                observation, reward, terminated, truncated, info = self.env.step(push)
+                total += float(reward)
+                if terminated or truncated:
+                    break
+            self._begin(observation)
+            reward = total
         return observation, float(reward), terminated, truncated, info
+
+    def _begin(self, observation: Any) -> None:
+        self._observations, self._actions, self._rewards = [deepcopy(observation)], list[np.ndarray](), list[float]()
+
+    def _keep(self, terminated: bool) -> None:
+        observations = _stack(self._observations)
+        actions, rewards = np.stack(self._actions), np.array(self._rewards)
+        self.episodes.append(RecordedEpisode(observations, actions, rewards, terminated, self._seed))
+
+    def _random_action(self) -> np.ndarray:
+        space = self.action_space
+        assert isinstance(space, gym.spaces.Box)  # as everywhere in SAC
+        return self._rng.uniform(space.low, space.high).astype(space.dtype)
 
 
 class AttachedExpert:
@@ -143,6 +172,7 @@ def record(
     seed: int = 0,
     made_of: TrainingEnvironment | None = None,
     safe: bool = False,
+    disturbed: float = 0.0,
 ) -> Evaluation:
     """
     Write episodes of training scenes as a Minari dataset.
@@ -154,12 +184,13 @@ def record(
     :param seed: See :func:`play_training_scenes`
     :param made_of: See :func:`find_player`
     :param safe: Run nothing that the model's file or folder holds
+    :param disturbed: See :class:`Recorder`
     :return: The scores of the episodes
     :raises UserError: If the model or the environment cannot be made, or the folder cannot be written
     """
     check_new(path)
     player, environment = find_player(model, env_id, made_of, safe)
-    recording = play_training_scenes(player, env_id, environment, n_episodes, seed)
+    recording = play_training_scenes(player, env_id, environment, n_episodes, seed, disturbed)
     write_demonstrations(
         path,
         recording.episodes,
@@ -190,7 +221,9 @@ def find_player(
     return loaded, environment | (environment_parts(made_of) if made_of is not None else {})
 
 
-def play_training_scenes(player: Any, env_id: str, environment: dict[str, Any], n_episodes: int, seed: int = 0) -> Recording:
+def play_training_scenes(
+    player: Any, env_id: str, environment: dict[str, Any], n_episodes: int, seed: int = 0, disturbed: float = 0.0
+) -> Recording:
     """
     Play episodes of training scenes, never of held-out ones.
 
@@ -199,24 +232,27 @@ def play_training_scenes(player: Any, env_id: str, environment: dict[str, Any], 
     :param environment: Arguments of ``make_evaluation_env``
     :param n_episodes: Number of episodes, of different scenes as long as there are any left
     :param seed: Chooses the scenes; episode k is reset with ``seed + k``
+    :param disturbed: See :class:`Recorder`
     :return: The episodes and their scores
     :raises UserError: If the environment cannot be made
     """
     if n_episodes < 1:
         raise UserError(f"a recording needs at least 1 episode, got {n_episodes}")
+    if not 0.0 <= disturbed < 1.0:
+        raise UserError(f"the probability of a disturbance must be at least 0 and less than 1, got {disturbed}")
     env = make_training_env(env_id, environment["env_kwargs"], environment["env_wrapper"])
-    recorder = Recorder(Monitor(env))
+    recorder = Recorder(Monitor(env), disturbed)
     if player is None:
         player = AttachedExpert(env_id, env)
         venv: VecEnv = DummyVecEnv([lambda: FixedEpisodes(recorder)])
     else:
         venv = make_evaluation_env(player, env_id, **environment | {"env_wrapper": lambda _: recorder})
     try:
-        evaluations, recorded = [], []
+        evaluations, recorded = list[Evaluation](), list[RecordedEpisode]()
         for episode in training_episodes(env_id, n_episodes, seed):
-            evaluation, demonstration = _best_attempt(player, venv, recorder, episode)
+            evaluation, demonstrations = _best_attempt(player, venv, recorder, episode)
             evaluations.append(evaluation)
-            recorded.append(demonstration)
+            recorded += demonstrations
     finally:
         venv.close()
     return Recording(_joined(evaluations), recorded, env)
@@ -247,7 +283,7 @@ def environment_parts(made_of: TrainingEnvironment) -> dict[str, Any]:
     return {"env_kwargs": import_names(made_of.env_kwargs or {}), "env_wrapper": import_wrappers(made_of.env_wrapper)}
 
 
-def _best_attempt(player: Any, venv: VecEnv, recorder: Recorder, episode: Episode) -> tuple[Evaluation, RecordedEpisode]:
+def _best_attempt(player: Any, venv: VecEnv, recorder: Recorder, episode: Episode) -> tuple[Evaluation, list[RecordedEpisode]]:
     """Play an episode; an expert with several plans plays it until it succeeds, and its best attempt counts."""
     attempts = []
     for attempt in range(getattr(player, "attempts", 1)):
@@ -255,7 +291,7 @@ def _best_attempt(player: Any, venv: VecEnv, recorder: Recorder, episode: Episod
             player.again = attempt > 0
         recorder.episodes.clear()
         evaluation = run_episodes(player, venv, [episode])
-        attempts.append((evaluation, recorder.episodes[0]))
+        attempts.append((evaluation, recorder.episodes[:]))
         if evaluation.successes[0] == 1.0:
             break
     return max(attempts, key=lambda one: one[0].score)

@@ -98,6 +98,8 @@ def test_a_trained_model_is_recorded_in_its_environment(tmp_path, capsys):
         (["--model", "expert", "--env", "FoldClot-v0"], "did you mean FoldCloth-v0?"),
         (["--model", "nothing.zip", "--env", "Pendulum-v1"], "there is no model nothing.zip"),
         (["--model", "expert", "--env", "PourWater-v0", "-n", "0"], "at least 1 episode"),
+        (["--model", "expert", "--env", "PourWater-v0", "--disturbed", "1"], "the probability of a disturbance must be"),
+        (["--model", "expert", "--env", "PourWater-v0", "--disturbed", "nan"], "the probability of a disturbance must be"),
         (["--model", "expert", "--env", "PourWater-v0", "--env-kwargs", "image_size:-1"], "cannot make PourWater-v0"),
         (["--model", "expert", "--env", "PourWater-v0", "-conf", "none.yml"], "cannot read none.yml"),
         (["--model", "expert", "--env", "PourWater-v0", "--ranker", "none.npz"], "there is no ranker none.npz"),
@@ -293,6 +295,61 @@ def test_observations_are_copied():
     while not recorder.episodes:
         recorder.step(np.zeros(1))
     assert recorder.episodes[0].observations[:, 0].tolist() == [0, 1, 2, 3, 4]
+
+
+class Integrator(gym.Env):
+    """Sums actions for 200 steps; the reward is the number of steps so far."""
+
+    observation_space, action_space = spaces.Box(-500, 500, (1,), np.float64), spaces.Box(-2, 2, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.moves = []
+        return np.zeros(1), {}
+
+    def step(self, action):
+        self.moves.append(float(action[0]))
+        return np.array([sum(self.moves)]), float(len(self.moves)), False, len(self.moves) == 200, {}
+
+
+def played_with_disturbances(seed):
+    """The episodes, the moves of the environment, and the sum of the rewards of one who always plays 1."""
+    recorder = Recorder(Integrator(), disturbed=0.1)
+    recorder.reset(seed=seed)
+    done, total = False, 0.0
+    while not done:
+        _, reward, _, done, _ = recorder.step(np.ones(1))
+        total += reward
+    return recorder.episodes, recorder.unwrapped.moves, total
+
+
+def test_disturbances_are_random_actions_that_are_not_recorded():
+    episodes, moves, total = played_with_disturbances(seed=3)
+    assert len(episodes) > 5 and total == 200 * 201 / 2
+    places = np.concatenate([[0.0], np.cumsum(moves)])
+    at, gaps = 0, []
+    for episode in episodes:
+        begin = int(np.flatnonzero(np.isclose(places[at:], episode.observations[0, 0]))[0]) + at
+        gaps.append(moves[at:begin])
+        at = begin + len(episode.rewards)
+        assert (episode.actions == 1.0).all() and not episode.terminated
+        np.testing.assert_array_equal(episode.observations[:, 0], [sum(moves[:i]) for i in range(begin, at + 1)])
+        np.testing.assert_array_equal(episode.rewards, np.arange(begin, at) + 1.0)
+    assert gaps[0] == [] and len({gap[0] for gap in gaps[1:]}) == len(episodes) - 1
+    assert all(len(set(gap)) == 1 and 3 <= len(gap) <= 8 for gap in gaps[1:])
+
+
+def test_disturbances_follow_from_the_seed():
+    first, again, other = (played_with_disturbances(seed)[1] for seed in (3, 3, 4))
+    assert first == again and first != other
+
+
+def test_a_disturbed_expert_makes_good_what_happened(tmp_path, capsys):
+    flags = ["--model", "expert", "--env", "StraightenRope-v0", "--env-kwargs", "obs_type:state", "-n", "2"]
+    assert main(["record", *flags, "--disturbed", "0.1", "-o", str(tmp_path / "demos")]) == 0
+    assert "(2 episodes)" in capsys.readouterr().out
+    episodes = list(Demonstrations(tmp_path / "demos").episodes())
+    assert len(episodes) > 4 and sum(len(one.rewards) for one in episodes) < 2 * 38
 
 
 def test_changes_are_those_of_training():

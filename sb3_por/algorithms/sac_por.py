@@ -68,6 +68,9 @@ class SACPOR(VisualSAC):
     :param augmentation_pad: Largest random shift of images in pixels; 0 for none
     :param n_augmentations: Augmentations of each observation, whose critic losses are averaged (DrQ's M)
     :param n_target_augmentations: Augmentations of each next observation, whose targets are averaged (DrQ's K)
+    :param planar_actions: Pairs of elements of an action of which one points right in the image and one points up, as in
+        ``[[0, 1], [4, 5]]``, for tasks that are the same in a turned and in a mirrored picture: batches are turned and
+        mirrored at random, and these elements with them (Lin et al. 2020, arXiv 1909.10707). None turns nothing
     :param diagnostics_interval: Log the objective's control and the gradient norm of each loss with respect to the encoder
         every ``diagnostics_interval`` updates
     :param demos: Folder of demonstrations in Minari's format, from which half of each batch is drawn; ``learn()`` reads it
@@ -128,6 +131,7 @@ class SACPOR(VisualSAC):
         augmentation_pad: int = 4,
         n_augmentations: int = 1,
         n_target_augmentations: int = 1,
+        planar_actions: list[Any] | None = None,
         diagnostics_interval: int = 200,
         demos: str | None = None,
         bc_coef: float = 0.0,
@@ -178,6 +182,7 @@ class SACPOR(VisualSAC):
             augmentation_pad=augmentation_pad,
             n_augmentations=n_augmentations,
             n_target_augmentations=n_target_augmentations,
+            planar_actions=planar_actions,
             diagnostics_interval=diagnostics_interval,
             demos=demos,
             bc_coef=bc_coef,

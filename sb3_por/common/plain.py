@@ -55,11 +55,16 @@ def arguments(algorithm: type[BaseAlgorithm], values: dict[str, Any]) -> dict[st
     """
     :param algorithm: Class of a model
     :param values: Its attributes, or those in its file
-    :return: The arguments of its constructor that are numbers, texts or None, but those in ``LEFT_OUT``
+    :return: The arguments of its constructor that are numbers, texts, None, or lists of such, but those in ``LEFT_OUT``
     """
     names = [name for name in inspect.signature(algorithm).parameters if name not in LEFT_OUT]
     numbers = {name: value.item() for name, value in values.items() if isinstance(value, np.generic)}
-    return {name: value for name, value in {**values, **numbers}.items() if name in names and isinstance(value, _SCALARS)}
+    return {name: value for name, value in {**values, **numbers}.items() if name in names and _is_simple(value)}
+
+
+def _is_simple(value: Any) -> bool:
+    """Whether a value is a scalar or a list of such, at any depth."""
+    return isinstance(value, _SCALARS) or (isinstance(value, list) and all(map(_is_simple, value)))
 
 
 def plain(value: Any) -> Any:

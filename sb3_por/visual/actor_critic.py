@@ -14,6 +14,7 @@ from sb3_por.visual.algorithm import VisualAlgorithm
 from sb3_por.visual.balance import EncoderGradients
 from sb3_por.visual.batch import Frames, demonstrated, encode, interleave, repeat, take
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
+from sb3_por.visual.symmetries import turned
 
 
 class Losses(NamedTuple):
@@ -260,15 +261,15 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         """
         :param batch_size: Number of transitions
         :param replay_buffer: Buffer to sample from; by default the model's own, and the demonstrations for every second row
-        :return: Samples with the frames that the objective uses
+        :return: Samples with the frames that the objective uses, turned if ``planar_actions`` says so
         """
-        if replay_buffer is not None:
-            return self._sample(batch_size, replay_buffer)
-        if self.demo_buffer is None:
-            return self._sample(batch_size, self.replay_buffer)
-        n_demos = batch_size // 2
-        own = self._sample(batch_size - n_demos, self.replay_buffer)
-        return interleave(own, self._sample(n_demos, self.demo_buffer))
+        if replay_buffer is not None or self.demo_buffer is None:
+            batch = self._sample(batch_size, self.replay_buffer if replay_buffer is None else replay_buffer)
+        else:
+            n_demos = batch_size // 2
+            own = self._sample(batch_size - n_demos, self.replay_buffer)
+            batch = interleave(own, self._sample(n_demos, self.demo_buffer))
+        return batch if self.planar_actions is None else turned(batch, self.planar_actions)
 
     def _sample(self, batch_size: int, buffer: Any) -> Any:
         """Samples of one buffer."""

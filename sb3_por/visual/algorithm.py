@@ -32,6 +32,7 @@ from sb3_por.visual.batch import Augmentation
 from sb3_por.visual.made_of import made_of
 from sb3_por.visual.normalization import transpose_inside
 from sb3_por.visual.replay_buffer import SequenceReplayBuffer
+from sb3_por.visual.symmetries import check_planar
 
 MAX = sys.float_info.max
 #: Smallest and largest value of each numeric argument
@@ -74,6 +75,7 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
     augmentation_pad: int
     n_augmentations: int
     n_target_augmentations: int
+    planar_actions: list[Any] | None
     diagnostics_interval: int
     demos: str | None
     bc_coef: float
@@ -126,6 +128,8 @@ class VisualAlgorithm(OverlappedTraining, SavedRandomState):
             # If set, SB3 would end the episode that a second learn() cuts off
             self.optimize_memory_usage = False
         self._check_buffer()
+        if self.planar_actions is not None:
+            check_planar(self.planar_actions, self.observation_space, self.action_space)
         self.policy.is_trained_here = True
         self._acceleration = AcceleratedUpdates(self.policy, self.precision, self.compile_mode)
         self._augmentation = Augmentation(self.policy, self.augmentation_pad)

@@ -23,6 +23,7 @@ class Losses(NamedTuple):
 
     :param critic: L_RL, a scalar
     :param objective: L_objective, a scalar, without its weight lambda; 0 without an objective
+    :param cloning: The cloning loss, a scalar, with its weight; 0 if it does not train the critic's trunk
     :param metrics: Detached scalars of the objective, to log
     :param present: First augmentation of o_t, preprocessed
     :param trunk_t: The critic's trunk features of it, detached, shape ``(batch, trunk_dim)``
@@ -30,6 +31,7 @@ class Losses(NamedTuple):
 
     critic: th.Tensor
     objective: th.Tensor
+    cloning: th.Tensor
     metrics: dict[str, th.Tensor]
     present: PyTorchObs
     trunk_t: th.Tensor
@@ -38,8 +40,9 @@ class Losses(NamedTuple):
 class VisualActorCritic(VisualAlgorithm, ABC):
     """
     A mixin for SB3's off-policy actor-critics (SAC, TQC). One update: encode each frame once per encoder; critic loss +
-    lambda * objective loss, one backward pass, one optimizer step over encoder, critic and objective (two steps, for
-    objectives with an optimizer of their own); actor and temperature on the detached trunk features; moving averages last.
+    lambda * objective loss, and the cloning loss where there are demonstrations, one backward pass, one optimizer step over
+    encoder, critic and objective (two steps, for objectives with an optimizer of their own); actor and temperature on the
+    detached trunk features; moving averages last.
 
     A subclass defines how its critic measures values: ``_next_values``, ``_critic_loss`` and ``_actor_values``.
     """
@@ -157,21 +160,26 @@ class VisualActorCritic(VisualAlgorithm, ABC):
             target = self.reward_scale * batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
         m = self.n_augmentations
         critic_loss = self._critic_loss(s_t, repeat(batch.actions, m), repeat(target, m))
-        return Losses(critic_loss, objective_loss, metrics, take(frames.present, batch_size), trunk_t[:batch_size].detach())
+        trunk_t = trunk_t[:batch_size]
+        cloning = s_t.new_zeros(())
+        if self._clones and self.actor.detach_trunk:
+            cloning = self._cloning_weight(target) * self._cloning_loss(batch, trunk_t)
+        return Losses(critic_loss, objective_loss, cloning, metrics, take(frames.present, batch_size), trunk_t.detach())
 
     def _step_encoder(self, losses: Losses) -> None:
         """One step of critic, encoder and objective on the sum of the losses, or one step for each loss."""
         own_optimizer = self.policy.objective_optimizer
         weighted = self.objective_weight * losses.objective
+        others = losses.critic + losses.cloning
         self.critic.optimizer.zero_grad()
         if own_optimizer is None:
-            (losses.critic + weighted).backward()
+            (others + weighted).backward()
             self.critic.optimizer.step()
             return
         parameters = [parameter for group in own_optimizer.param_groups for parameter in group["params"]]
         # Before the critic's step changes what this gradient was computed with
         gradients = th.autograd.grad(weighted, parameters, retain_graph=True, allow_unused=True)
-        losses.critic.backward()
+        others.backward()
         self.critic.optimizer.step()
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
@@ -187,11 +195,9 @@ class VisualActorCritic(VisualAlgorithm, ABC):
         temperature = self.temperature
         values = self._actor_values(features, actions)
         actor_loss = (temperature * log_prob - values).mean()
-        if self.demo_buffer is not None and self.bc_coef > 0:
+        if self._clones:
             cloning_loss = self._cloning_loss(batch, trunk)
-            # In units of the values, so that one weight fits all scales of rewards; fades to 0 at the end of training
-            weight = self.bc_coef * self._current_progress_remaining * values.detach().std()
-            actor_loss = actor_loss + weight * cloning_loss
+            actor_loss = actor_loss + self._cloning_weight(values) * cloning_loss
             self._metrics.add("cloning_loss", cloning_loss)
         self.actor.optimizer.zero_grad()
         # Named inputs: the critic's weights get no gradient, and none is computed for them
@@ -209,6 +215,14 @@ class VisualActorCritic(VisualAlgorithm, ABC):
             ent_coef_loss.backward()
             self.ent_coef_optimizer.step()
             self._metrics.add("ent_coef_loss", ent_coef_loss)
+
+    @property
+    def _clones(self) -> bool:
+        return self.demo_buffer is not None and self.bc_coef > 0
+
+    def _cloning_weight(self, values: th.Tensor) -> th.Tensor:
+        """In units of the values, so that one coefficient fits all scales of rewards; fades to 0 at the end of training."""
+        return self.bc_coef * self._current_progress_remaining * values.detach().std()
 
     def _cloning_loss(self, batch: Any, trunk: th.Tensor) -> th.Tensor:
         """Mean squared error of the deterministic action in the batch's demonstrations."""

@@ -156,6 +156,25 @@ def test_cloning_pulls_the_actions_to_those_of_the_demonstrations(tmp_path):
     assert distances[0] < 0.1 < distances[1]
 
 
+@pytest.mark.parametrize("share, bc_coef, reached", [(True, 1.0, True), (False, 1.0, False), (True, 0.0, False)])
+def test_cloning_trains_the_encoder_that_actor_and_critic_share(share, bc_coef, reached, tmp_path):
+    """An actor with a trunk of its own trains that."""
+    demos, kwargs = write(tmp_path / "demos", dots()), dict(POLICY, share_features_extractor=share)
+    model = make_model(VisualSAC, dots(), demos=demos, bc_coef=bc_coef, policy_kwargs=kwargs).learn(12)
+    model._current_progress_remaining = 0.5
+    cloning = model.losses(model.sample(8)).cloning
+    assert (cloning > 0) == reached
+    if reached:
+        trunk = list(model.critic.features_extractor.parameters())
+        assert all((gradient != 0).any() for gradient in th.autograd.grad(cloning, trunk))
+    before = copy.deepcopy(list(model.critic.features_extractor.parameters()))
+    model.critic.optimizer = th.optim.SGD(model.critic.parameters(), lr=1.0)
+    losses = model.losses(model.sample(8))
+    model._step_encoder(losses._replace(critic=0.0 * losses.critic))
+    after = model.critic.features_extractor.parameters()
+    assert any(not th.equal(a, b) for a, b in zip(before, after, strict=True)) == reached
+
+
 def test_cloning_fades_to_nothing_at_the_end_of_training(tmp_path):
     demos = write(tmp_path / "demos", dots())
     for progress_remaining, same in ((0.5, False), (0.0, True)):

@@ -199,23 +199,28 @@ class Study:
                 yield row
 
 
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--env", choices=EXPERT_IDS, default="StraightenRope-v0")
+    arguments.add_argument("-params", "--hyperparams", nargs="+", default={}, action=Settings, metavar="KEY:VALUE")
+    arguments.add_argument("--env-kwargs", nargs="+", default={}, action=Settings, metavar="KEY:VALUE")
+    arguments.add_argument("--frames", type=int, default=1, help="frames of an observation")
+    arguments.add_argument("--rounds", type=int, default=8)
+    arguments.add_argument("--episodes", type=int, default=25, help="of a round")
+    arguments.add_argument("--disturbed", type=float, default=0.0, help="probability that a disturbance follows a step")
+    arguments.add_argument("--updates", type=int, default=1250, help="of a round")
+    arguments.add_argument("--batch", type=int, default=64)
+    arguments.add_argument("--lr", type=float, default=7e-4)
+    arguments.add_argument("--scenes", type=int, default=20, help="held-out scenes")
+    arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--csv", type=Path, help="append scores to this table")
+    return arguments
+
+
 def main() -> None:
     """Parse the arguments and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", choices=EXPERT_IDS, default="StraightenRope-v0")
-    parser.add_argument("-params", "--hyperparams", nargs="+", default={}, action=Settings, metavar="KEY:VALUE")
-    parser.add_argument("--env-kwargs", nargs="+", default={}, action=Settings, metavar="KEY:VALUE")
-    parser.add_argument("--frames", type=int, default=1, help="frames of an observation")
-    parser.add_argument("--rounds", type=int, default=8)
-    parser.add_argument("--episodes", type=int, default=25, help="of a round")
-    parser.add_argument("--disturbed", type=float, default=0.0, help="probability that a disturbance follows a step")
-    parser.add_argument("--updates", type=int, default=1250, help="of a round")
-    parser.add_argument("--batch", type=int, default=64)
-    parser.add_argument("--lr", type=float, default=7e-4)
-    parser.add_argument("--scenes", type=int, default=20, help="held-out scenes")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--csv", type=Path, help="append scores to this table")
-    args = parser.parse_args()
+    args = parser().parse_args()
     th.set_num_threads(1)
     for row in Study(args).run():
         if args.csv is not None:

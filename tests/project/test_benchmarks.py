@@ -21,7 +21,7 @@ def load(name):
     return module
 
 
-balance, encoders, learner, time_to_score = (load(name) for name in ("balance", "encoders", "learner", "time_to_score"))
+balance, encoders, learner, sight, time_to_score = map(load, ("balance", "encoders", "learner", "sight", "time_to_score"))
 
 
 @pytest.mark.parametrize("name", learner.ALGORITHMS)
@@ -89,3 +89,15 @@ def test_the_time_to_a_score_is_that_of_the_first_evaluation_with_it():
     times = time_to_score.time_to_score(scores).set_index("seed")
     assert times.loc[0, ["env", "wanted", "step", "minutes"]].tolist() == ["PourWater-v0", 0.8, 200, 2]
     assert times.loc[1, ["step", "minutes"]].isna().all() and len(times) == 2
+
+
+def test_the_ceiling_of_sight_is_that_of_the_settings():
+    """The clone sees what the agent sees, plays as often as the agent acts, and is told what the expert would do."""
+    arguments = "--env StraightenRope-v0 --rounds 2 --episodes 1 --updates 2 --batch 8 --scenes 2 --frames 2"
+    study = sight.Study(sight.parser().parse_args([*arguments.split(), "--env-kwargs", "image_size:48"]))
+    row = list(study.run())[-1]
+    assert row["size"] == 48 and row["steps"] == 2 * 38 and row["expert"] > 0.9 > row["score"] >= row["worst"]
+    assert study.planar_actions == [[0, 1], [4, 5]] and study.clone.encoder.n_positions == 5 * 24
+    first, second, later = (study.memory.stack(step) for step in (38, 39, 40))
+    assert (first[:3] == first[3:]).all() and (second[:3] == first[:3]).all() and (later[:3] == second[3:]).all()
+    assert all((action[[3, 7]] ** 2 == 1).all() for action in study.memory.actions), "the expert's, whoever plays"

@@ -28,11 +28,15 @@ class VisualActor(Actor):
     Takes the arguments of SB3's SAC actor.
 
     :param detach_trunk: Stop the gradient after the trunk, which belongs to the critic
+    :param layer_norm: Use layer norm in the hidden layers
     """
 
-    def __init__(self, *args: Any, detach_trunk: bool = True, **kwargs: Any):
+    def __init__(self, *args: Any, detach_trunk: bool = True, layer_norm: bool = False, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.detach_trunk = detach_trunk
+        self.layer_norm = layer_norm
+        if layer_norm:
+            self.latent_pi = with_layer_norm(self.latent_pi)
         self.projection = make_projection(self.features_extractor)
         if not self.use_sde:
             # Start with a standard deviation of about 1, as SB3 does, instead of e^-4, the middle of the range
@@ -41,7 +45,8 @@ class VisualActor(Actor):
             nn.init.constant_(self.log_std.bias, math.atanh(-middle / half_range))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "detach_trunk": self.detach_trunk}
+        own = dict(detach_trunk=self.detach_trunk, layer_norm=self.layer_norm)
+        return super()._get_constructor_parameters() | own
 
     def trunk(self, observations: PyTorchObs) -> th.Tensor:
         """
@@ -199,6 +204,7 @@ class VisualPolicy(BasePolicy):
         its own, trained by its loss
     :param critic_layer_norm: Use layer norm in the Q networks: their hidden units stay alive, and values of unseen actions
         stay bounded (https://arxiv.org/abs/2302.02948)
+    :param actor_layer_norm: Use layer norm in the actor's hidden layers
     :param objective_class: Auxiliary objective, trained together with the critic; None for none
     :param objective_kwargs: Keyword arguments of the objective
     """
@@ -223,6 +229,7 @@ class VisualPolicy(BasePolicy):
         normalize_images: bool = True,
         share_features_extractor: bool = True,
         critic_layer_norm: bool = False,
+        actor_layer_norm: bool = False,
         objective_class: type[Objective] | None = None,
         objective_kwargs: dict[str, Any] | None = None,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -239,6 +246,7 @@ class VisualPolicy(BasePolicy):
             # As SB3 does for its own extractors: no check of type and bounds
             features_extractor_kwargs["normalized_image"] = True
         self.critic_layer_norm = critic_layer_norm
+        self.actor_layer_norm = actor_layer_norm
         self.objective_class = objective_class
         self.objective_kwargs = objective_kwargs or {}
         super().__init__(
@@ -286,7 +294,8 @@ class VisualPolicy(BasePolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return VisualActor(**actor_kwargs, detach_trunk=features_extractor is not None).to(self.device)
+        own = dict(detach_trunk=features_extractor is not None, layer_norm=self.actor_layer_norm)
+        return VisualActor(**actor_kwargs, **own).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
@@ -298,6 +307,7 @@ class VisualPolicy(BasePolicy):
             super()._get_constructor_parameters(),
             share_features_extractor=self.share_features_extractor,
             critic_layer_norm=self.critic_layer_norm,
+            actor_layer_norm=self.actor_layer_norm,
             objective_class=self.objective_class,
             objective_kwargs=self.objective_kwargs,
         )

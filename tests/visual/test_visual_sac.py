@@ -197,6 +197,21 @@ def test_hidden_units_stay_between_always_and_never_where_values_start_at_the_me
     assert started > share_of_switching_units(policy_kwargs=policy_kwargs) + 0.2
 
 
+@pytest.mark.parametrize("share", [True, False])
+@pytest.mark.parametrize("cls", [VisualSAC, TQCPOR])
+def test_layer_norm_of_the_actor_is_trained_and_follows(cls, share, tmp_path):
+    model = make_model(cls, policy_kwargs=dict(POLICY, actor_layer_norm=True, share_features_extractor=share))
+    kinds = [type(layer).__name__ for layer in model.actor.latent_pi]
+    assert kinds == ["Linear", "LayerNorm", "ReLU"] * (len(kinds) // 3)
+    norms = [layer.weight for layer in model.actor.latent_pi if isinstance(layer, th.nn.LayerNorm)]
+    before = snapshot(norms)
+    model.train(2, 8)
+    assert norms and all(not th.equal(*pair) for pair in zip(before, norms, strict=True))
+    model.policy.save(tmp_path / "policy.pth")
+    loaded = type(model.policy).load(tmp_path / "policy.pth", device="cpu")
+    assert all(map(th.equal, model.actor.state_dict().values(), loaded.actor.state_dict().values()))
+
+
 @pytest.mark.parametrize("cls", [VisualSAC, TQCPOR])
 def test_layer_norm_of_the_critics_is_trained_and_follows(cls):
     model = make_model(cls, policy_kwargs=dict(POLICY, critic_layer_norm=True))
